@@ -36,9 +36,9 @@ examples:
 exit codes: 0 usable; 1 not usable; 2 invalid file, no drive, or it refuses its set-up; 130
 interrupted
 """
-# Any number: with it, a drive in rpm needs no 0x608F.
+# An arbitrary value, so that a drive in rpm needs no 0x608F.
 _COUNTS_PER_TURN = 20_000.0
-# Time in which device_driver ends [s].
+# Time for device_driver to shut down [s].
 _END = 2.0
 
 

@@ -38,7 +38,7 @@ HOLDS = Delivery(depth=100, reliable=False)
 _EMERGENCY_STOPS = Delivery(depth=1000)
 # Longer messages are rejected: the conversion takes up to 200 ns per byte [bytes].
 _MAX_MESSAGE = 4096
-# If only these fields change, the status is published once in this period [s].
+# If only these fields change, the status is published at most once per period [s].
 _STATUS_PERIOD = 0.5
 _FREQUENT = {"insertion_m", "rotation_rad", "holds_ignored"}
 _OTHERS = operator.attrgetter(*({row.name for row in dataclasses.fields(DeviceStatus)} - _FREQUENT))
@@ -131,13 +131,13 @@ class DeviceInterface:
     def begin(self, procedure: Procedure[ServiceResult], then: Then, at: Moment) -> Actions:
         """Begin a procedure; `then` handles its result.
 
-        A stop, an emergency stop, a fault and disabling cancel it.
+        It is cancelled by a stop, an emergency stop, a fault or disabling.
         """
         self._task = _Task(Running(procedure), then, self._supervisor.stops)
         yield from self.advance(at)
 
     def advance(self, at: Moment) -> Actions:
-        """Resume the procedure under way; call it after each event that may concern it."""
+        """Resume the procedure under way; call it after each event that may affect it."""
         task = self._task
         if task is None:
             return
@@ -155,7 +155,7 @@ class DeviceInterface:
             yield from task.then(task.running.result[0], at)
 
     def cancel(self, reason: str, at: Moment) -> Actions:
-        """Cancel the procedure under way; its result has the reason."""
+        """Cancel the procedure under way; its result states the reason."""
         task, self._task = self._task, None
         if task is not None:
             task.running.cancel()
@@ -229,7 +229,7 @@ class DeviceInterface:
         *,
         switch: bool = False,
     ) -> Service:
-        """Return a service; `switch` means that its request has a Boolean."""
+        """Return a service; `switch` means that its request contains a Boolean."""
 
         def handle(on: bool | None, number: int, at: Moment) -> Actions:
             def reply(result: ServiceResult, _: Moment) -> Actions:

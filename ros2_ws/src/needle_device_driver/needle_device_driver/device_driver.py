@@ -37,7 +37,7 @@ _REPLY_TIMEOUT = 0.75 * PERIOD
 _SEARCH_PERIOD = 0.25
 EXIT_BROKEN = 3
 """The cycle raised an error: the axes are no longer controlled."""
-# A cycle is late if it begins later by this share of a period.
+# A cycle is late if its delay exceeds this share of a period.
 _LATE = 0.5
 
 
@@ -73,7 +73,7 @@ class DeviceDriver(Component):
     name : str
         Name of the node.
     search_from : float
-        Steady time of the first search for the drives: discovery of another device takes time [s].
+        Steady time of the first search for the drives [s]; discovering another device takes time.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class DeviceDriver(Component):
     drives : tuple of Drives
         Each kind of drive in use.
     waiting : str
-        Why services are not ready; empty: they are.
+        Reason why services are not ready; empty: ready.
     searches : bool
         Whether the driver searches for the drives.
     is_set_up : bool
@@ -164,9 +164,9 @@ class DeviceDriver(Component):
         Parameters
         ----------
         handler : callable
-            Its last argument is the moment.
+            Handler whose last argument is the moment.
         ends : bool
-            Whether an error also ends the component; the drives then stop without its heartbeat.
+            Whether an error also ends the component; without its heartbeat, the drives then stop.
         """
 
         def guarded(*arguments: Any) -> Actions:
@@ -269,7 +269,7 @@ class DeviceDriver(Component):
             if error:
                 return ServiceResult(False, error)
         if self.supervisor.state is not State.UNCONFIGURED:
-            # Clear an earlier fault; an emergency stop that is pressed stays.
+            # Clear an earlier fault; a pressed emergency stop remains.
             result = yield from self.supervisor.reset(now)
             if not result.success:
                 return result

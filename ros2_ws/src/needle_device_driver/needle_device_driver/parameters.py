@@ -89,7 +89,7 @@ class DriverParameters(SafetyLimits):
         Raises
         ------
         UserError
-            A parameter out of bounds, or parameters of a drive that contradict each other.
+            If a parameter is out of bounds, or parameters of a drive contradict each other.
         """
         check_fields(self)
         for backend in self.backends:

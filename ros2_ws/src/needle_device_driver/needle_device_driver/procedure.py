@@ -23,7 +23,7 @@ class Wait:
     until : callable
         The procedure resumes as soon as this returns true.
     seconds : float
-        It resumes after this time at the latest [s].
+        Time after which it resumes at the latest [s].
     """
 
     until: Callable[[], bool]
@@ -31,7 +31,7 @@ class Wait:
 
 
 Procedure = Generator[Wait, float, T]
-"""It yields waits, and each `send` passes the steady time at which it resumes [s]."""
+"""Generator of waits; each `send` passes the steady time at which it resumes [s]."""
 
 
 def run(
@@ -39,7 +39,7 @@ def run(
     wait: Callable[[Callable[[], bool], float], Any],
     clock: Callable[[], float],
 ) -> T:
-    """Run a procedure to its end, and block meanwhile.
+    """Run a procedure to its end, and block until then.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def run(
     wait : callable
         Waits until its first argument returns true, at most for the second one [s].
     clock : callable
-        Steady time [s].
+        Returns the steady time [s].
 
     Returns
     -------

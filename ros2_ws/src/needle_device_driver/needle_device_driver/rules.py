@@ -6,7 +6,7 @@ import enum
 
 
 class Rule(enum.Enum):
-    """A safety rule; docs/safety.md has its bound."""
+    """A safety rule; docs/safety.md states its bound."""
 
     HOLD_TO_RUN = "hold_to_run"
     HOLD_AGE = "hold_age"

@@ -104,7 +104,7 @@ class SimulatedAxis(Axis):
         before = self._position
         distance = self._target - before
         step = self._speed * period
-        # The tolerance prevents one more period for the rounding error of speed times period.
+        # The tolerance prevents an extra period due to the rounding error of speed times period.
         if abs(distance) <= step * (1.0 + 1e-9):
             self._position = self._target
         else:

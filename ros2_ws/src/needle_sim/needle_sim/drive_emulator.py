@@ -35,7 +35,7 @@ from needle_sim.drives.motor import MotorSettings
 
 CIA402 = "cia402"
 GROUP = "needle_sim.drives"
-"""Group of the entry points: name to a callable that returns an `EmulatedDrives`."""
+"""Group of the entry points, which are callables that return an `EmulatedDrives`."""
 _OWN = {
     "galil": "needle_sim.drives.galil_drives:GalilDrives",
     "zaber": "needle_sim.drives.zaber_drives:ZaberDrives",
@@ -124,7 +124,7 @@ class DriveEmulatorParameters:
 
     @property
     def axes_of(self) -> dict[str, tuple[str, ...]]:
-        """Return drives -> their axes."""
+        """Axes of each kind of drive."""
         names = self.drives.split(",")
         chosen = dict(zip(AXES, (names[0], names[-1]), strict=True))
         return {
@@ -177,7 +177,7 @@ class DriveEmulator(Component):
     Attributes
     ----------
     connections : dict of str to EmulatedDrives
-        Port to the drives behind it; tests inject faults there.
+        Drives behind each port; tests inject faults there.
     """
 
     name = "drive_emulator"
@@ -244,7 +244,7 @@ class DriveEmulator(Component):
             yield Diagnose("drives", self._health())
 
     def _execute(self, line: str, now: float) -> bool | None:
-        """Execute one of `COMMANDS`; return whether to plug the adapters in or out, if either."""
+        """Execute one of `COMMANDS`; return whether to plug the adapters in; None: no change."""
         drives_of = {axis: drives for drives in self.connections.values() for axis in drives.motors}
         match line.split():
             case ["cut_bus"]:
@@ -308,7 +308,7 @@ class DriveEmulator(Component):
 
 
 def _error_code(text: str) -> int:
-    """Return an error code of 16 bits; 0 for any other text."""
+    """Return a 16-bit error code; 0 for any other text."""
     with contextlib.suppress(ValueError):
         code = int(text, 0)
         return code if 1 <= code <= 0xFFFF else 0
@@ -316,7 +316,7 @@ def _error_code(text: str) -> int:
 
 
 def _load_emulator(name: str) -> Callable[[Mapping[str, MotorSettings], float], EmulatedDrives]:
-    """Return what makes the drives of a name, of this package or another one.
+    """Return the factory for the drives of a name, from this package or another one.
 
     Its arguments are the motors of the axes, and the time of power-up [s].
     """

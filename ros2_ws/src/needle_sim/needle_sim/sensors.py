@@ -1,4 +1,4 @@
-"""Sensors of the simulated rig: the messages that an exposure of the needle causes."""
+"""Sensors of the simulated rig: the messages that result from an exposure of the needle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 RIG = "rig"
-# A tip position does not determine the heading [rad^2].
+# Variance of the undetermined orientation [rad^2].
 _UNKNOWN_ORIENTATION = 1e6
 # A variance of 0 would mean "unknown" [m^2].
 _MIN_POSITION_VARIANCE = 1e-12
@@ -82,7 +82,7 @@ def make_sensor(bench: SimulatedBench, settings: SimRigParameters) -> Sensor:
     """Return the sensor of the level that the settings name."""
     if settings.level == "tip":
         return TipSensor(bench, settings)
-    # Loading the renderer takes long, and level tip does not need it.
+    # Loading the renderer takes a long time, and level tip does not need it.
     from needle_sim.cameras import CameraSensor  # noqa: PLC0415
 
     return CameraSensor(bench, settings)

@@ -10,7 +10,7 @@ from needle_device_driver.procedure import Procedure, side_by_side
 from needle_device_driver.rules import Rule
 
 PERIOD = 0.02
-"""Of the cycle: set-points, answers [s]."""
+"""Period of the control cycle [s]."""
 
 
 class AxisError(Exception):
@@ -55,7 +55,7 @@ class AxisSnapshot:
     at_inner_switch : bool
         Whether the limit switch at the far end is active.
     fault : str
-        Why the axis refuses to move; empty: no fault.
+        Reason why the axis refuses to move; empty: no fault.
     fault_rule : Rule
         The rule behind the fault.
     ready : bool
@@ -67,7 +67,7 @@ class AxisSnapshot:
         Whether the axis was stopped while it was blocked, and is therefore switched off until the
         next order to move.
     stop_failure : str
-        How a stopped axis still moves or has power after its stop time; empty: it does not.
+        How the axis failed to stop: still moving or powered after its stop time; empty: it did not.
     origin : int
         Changes whenever the zero of `position` changes.
     """
@@ -99,7 +99,7 @@ class Axis(abc.ABC):
     Attributes
     ----------
     actuated : bool
-        Whether the axis has a motor; otherwise a hand moves it and the axis only measures.
+        Whether the axis has a motor; otherwise it is moved by hand and only measured.
     """
 
     actuated = True
@@ -114,7 +114,7 @@ class Axis(abc.ABC):
 
     @abc.abstractmethod
     def home(self, speed: float) -> Procedure[None]:
-        """Start to search for the home switch, at most at `speed`; position 0 is there.
+        """Start searching for the home switch, at most at `speed`; the switch is position 0.
 
         The axis is not homed until it has found the switch.
         """
@@ -129,7 +129,7 @@ class Axis(abc.ABC):
 
     @abc.abstractmethod
     def reset(self) -> Procedure[None]:
-        """Acknowledge a fault and wait until it is gone; moves nothing."""
+        """Acknowledge a fault and wait until it clears; moves nothing."""
 
     @abc.abstractmethod
     def poll(self, now: float) -> AxisSnapshot:
@@ -178,7 +178,7 @@ class PairSnapshot:
         return " and ".join(name for name, at in self.by_name.items() if at.released_after_block)
 
     def stop_failures(self, oldest: float) -> str:
-        """Return which axes did not stop, or do not answer, and how; empty: none.
+        """Describe the axes that did not stop or do not answer; empty: none.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class PairSnapshot:
 
 
 class AxisPair:
-    """Gives orders to both axes; an error of one does not keep the order from the other.
+    """Sends orders to both axes; an error on one axis does not affect the order to the other.
 
     Parameters
     ----------
@@ -223,12 +223,12 @@ class AxisPair:
         self.rotation = rotation
 
     def each(self, order: Callable[[Axis], None]) -> None:
-        """Give an order to both axes.
+        """Send an order to both axes.
 
         Raises
         ------
         AxisError
-            With the errors of both axes, after both got the order.
+            After both axes received the order, with the errors of both.
         """
         errors: list[AxisError] = []
         for axis in (self.insertion, self.rotation):
@@ -239,7 +239,7 @@ class AxisPair:
         _raise_all(errors)
 
     def side_by_side(self, order: Callable[[Axis], Procedure[None]]) -> Procedure[None]:
-        """Run a procedure of both axes at the same time; raises as `each`."""
+        """Run a procedure on both axes at the same time; raises as `each`."""
         errors: list[AxisError] = []
         axes = self.insertion, self.rotation
         yield from side_by_side(*(_collect_error(order(axis), errors) for axis in axes))

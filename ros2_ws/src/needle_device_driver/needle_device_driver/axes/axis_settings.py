@@ -11,12 +11,12 @@ from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 
 Positive = Annotated[float, Bounds(ABOVE_0, math.inf, "SI")]
 HERE = (35, 37)
-"""Homing methods of CiA 402 that set the home where the axis stands."""
+"""CiA 402 homing methods that define the present position as home."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AxisSettings:
-    """Settings of an axis that every kind of drive has; lengths in m or rad.
+    """Axis settings common to all kinds of drives; lengths in m or rad.
 
     Attributes
     ----------
@@ -27,19 +27,19 @@ class AxisSettings:
     speed, acceleration, quick_stop_deceleration : float
         Greatest speed [unit/s]; ramps [unit/s^2].
     homing_method : int
-        By its number in CiA 402; 37: the home is where the axis stands.
+        CiA 402 number of the homing method; 37: the present position becomes home.
     following_error : float
-        Bound of the distance from the set-point.
+        Largest allowed distance from the set-point.
     lower, upper : float
         Software limits, from home.
     tolerance : float
-        An axis stands still in a cycle if it moves no farther.
+        Largest motion per cycle of an axis at rest.
     unit : str
-        Of the axis: m or rad.
+        Unit of the axis: m or rad.
     travel : float
         Greatest distance from home.
     actuated : bool
-        Whether the drive has a motor; otherwise a hand moves the axis.
+        Whether the drive has a motor; otherwise the axis is moved by hand.
     """
 
     counts_per_unit: Positive
@@ -62,7 +62,7 @@ class AxisSettings:
         Raises
         ------
         UserError
-            A value out of bounds.
+            If a value is out of bounds.
         """
         check_bounded_fields(self)
         if not self.lower < self.upper:
@@ -89,12 +89,12 @@ class AxisSettings:
         return max(1, round(value * self.counts_per_unit / unit))
 
     def text(self, value: float) -> str:
-        """Return a distance for messages."""
+        """Format a distance for messages."""
         return f"{value * 1e3:.4g} mm" if self.unit == "m" else f"{value:.4g} rad"
 
     @property
     def longest_search(self) -> float:
-        """Farthest that homing searches for the switch: a fifth beyond the travel."""
+        """Longest search for the home switch: 20 % more than the travel."""
         return 1.2 * self.travel
 
     @property
@@ -104,7 +104,7 @@ class AxisSettings:
 
     @property
     def limits(self) -> str:
-        """Software limits as messages have them."""
+        """Software limits, formatted for messages."""
         return f"limits [{self.lower:.6g}, {self.upper:.6g}]"
 
     @property

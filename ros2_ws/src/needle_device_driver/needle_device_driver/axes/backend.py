@@ -1,4 +1,4 @@
-"""Kinds of drives that device_driver moves, each an entry point of a package."""
+"""Kinds of drives that device_driver supports, each an entry point of a package."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from needle_device_driver.axes.drives import Drives
 GROUP = "needle_device_driver.axes"
 """Group of the entry points; their names are the values of `insertion_drive`, `rotation_drive`."""
 HAND = "hand"
-"""The drive only measures the axis, and a hand moves it."""
+"""Drive of an axis that is moved by hand and only measured."""
 _OWN = {
     "cia402": "needle_device_driver.cia402.backend:BACKEND",
     "stepdir": "needle_device_driver.backends.stepdir:BACKEND",
@@ -39,7 +39,7 @@ class Backend:
     port : str
         Name of the component's port to the drives.
     settings : type
-        Dataclass of its parameters of device_driver (`fixed_parameter` fields).
+        Dataclass of the parameters it adds to device_driver (`fixed_parameter` fields).
     make : callable
         Returns its `Drives` from all parameters of device_driver and the settings of its axes.
     open_port : callable
@@ -61,14 +61,14 @@ def backends() -> dict[str, Backend]:
     Raises
     ------
     UserError
-        A backend that cannot be loaded, or two of one name.
+        If a backend cannot be loaded, or two have the same name.
     """
     own = [EntryPoint(name, value, GROUP) for name, value in _OWN.items()]
     loaded: dict[str, Backend] = {}
     for entry in (*own, *entry_points(group=GROUP)):
         try:
             backend = entry.load()
-        # A package of the user may raise anything.
+        # A third-party package may raise any exception.
         except Exception as error:
             raise UserError(f"drive {entry.name!r} ({entry.value}): {error}; {_PAGE}") from error
         if not isinstance(backend, Backend):
@@ -84,7 +84,7 @@ def parameters_of(loaded: Iterable[Backend]) -> tuple[type[Any], ...]:
     Raises
     ------
     UserError
-        Two backends with a parameter of one name.
+        If two backends have a parameter with the same name.
     """
     kinds = tuple(dict.fromkeys(backend.settings for backend in loaded))
     owners: dict[str, type[Any]] = {}

@@ -13,13 +13,13 @@ class Capabilities:
     Attributes
     ----------
     watchdog : float
-        Time without the computer after which it stops by itself, with the default parameter
+        Silence of the computer after which it stops by itself, with the default parameter
         `watchdog` [s]; infinite: it has no watchdog.
     longest_order : float
-        Longest time that a set-point keeps it moving if no further one follows [s]; for a drive
+        Longest time for which the last set-point keeps it moving [s]; for a drive
         with trapezoidal profiles 0.02 s + speed / deceleration.
     response_time : float
-        From an order to its effect in the feedback [s]; at least one cycle of 0.02 s, and more if
+        Delay from an order to its effect in the feedback [s]; at least one cycle (0.02 s), more if
         the drive filters its motion or its answers are old.
     encoder : bool
         Whether it measures its position; otherwise it counts its own steps.
@@ -44,5 +44,5 @@ class Capabilities:
 
     @property
     def has_watchdog(self) -> bool:
-        """Whether it stops by itself without the computer."""
+        """Whether it stops by itself when the computer is silent."""
         return math.isfinite(self.watchdog)

@@ -21,17 +21,17 @@ Fault = tuple[Rule, str]
 
 
 class CyclicAxis(Axis):
-    """Axis of a drive, in whose cycles the orders are sent.
+    """Axis of a drive that receives its orders once per cycle.
 
     Orders return at once, and `transmit` sends them in the next cycle; only a stop is sent
-    immediately. The drive ends at the last set-point if no further one arrives.
+    immediately. The drive stops at the last set-point if no new one arrives.
 
     Parameters
     ----------
     name : str
         Insertion or rotation.
     settings : AxisSettings
-        The axis.
+        Settings of the axis.
     link : Link
         Connection to the drive.
 
@@ -41,7 +41,7 @@ class CyclicAxis(Axis):
         Insertion or rotation.
     """
 
-    # Bounds of the set-points of an axis without home [counts].
+    # Bounds of the set-points of an axis that is not homed [counts].
     _counter = (-math.inf, math.inf)
 
     def __init__(self, name: str, settings: AxisSettings, link: Link) -> None:
@@ -97,7 +97,7 @@ class CyclicAxis(Axis):
         settings, counts = self._settings, self._settings.counts(target)
         lower, upper = settings.limits_counts if self._homed else self._counter
         if not lower <= counts <= upper:
-            # Beyond its last count a drive may continue, stop, or return all the way.
+            # When its counter overflows, a drive may continue, stop, or travel all the way back.
             raise AxisError(
                 f"{self.name} axis: target {target:.6g} is outside the drive's "
                 f"{settings.limits if self._homed else 'counter; home it, or set it nearer 0'}",
@@ -114,20 +114,20 @@ class CyclicAxis(Axis):
         return counts + self._zero
 
     def _count_from_home(self, zero: int = 0) -> None:
-        """End a homing: positions count from `zero` [counts], as the drive's limits will."""
+        """Complete a homing: positions, and later the limits, count from `zero` [counts]."""
         self._homing, self._homed, self._zero = None, True, zero
-        # The limits are written when the drive is off.
+        # The limits can only be written while the drive is off.
         self._limits_due = self.actuated
         self._origin += 1
 
     def _restart_feedback(self) -> None:
-        """Forget the motion before a set-up or reset, which may change the zero of positions."""
+        """Discard the motion before a set-up or reset, which may shift the zero of positions."""
         self._origin += 1
         self._speed.reset()
         self._velocity = 0.0
 
     def _snapshot(self, position: int, set_point: int, **state: Any) -> AxisSnapshot:
-        """Return the feedback with both places [counts]; `state` has what the drive reports."""
+        """Return the feedback with both positions [counts]; `state` holds the other fields."""
         rule, fault = self._fault or (Rule.ONE_FAULT_STOPS_BOTH, "")
         return AxisSnapshot(
             position=self._settings.position(position - self._zero),
@@ -152,15 +152,15 @@ class Drives(abc.ABC):
         Name of the component's port.
     link : Link
         The connection.
-    axes : sequence of Axis
-        Insertion, rotation or both, by their names.
+    axes : mapping of str to CyclicAxis
+        Insertion, rotation or both, by name.
 
     Attributes
     ----------
     capabilities : Capabilities
         Abilities of the drives.
     unanswered : int
-        Number of cycles without an answer of each drive.
+        Number of cycles in which not every drive answered.
     """
 
     capabilities: Capabilities
@@ -171,7 +171,7 @@ class Drives(abc.ABC):
 
     @property
     def missing_optional_parts(self) -> tuple[str, ...]:
-        """Parts that the drives lack, although a rule profits from them."""
+        """Optional parts that the drives lack and that a safety rule would use."""
         return ()
 
     @property
@@ -184,7 +184,7 @@ class Drives(abc.ABC):
         """Receive a batch from the port."""
 
     def probe(self) -> Procedure[str]:
-        """Open the link and request an answer of every drive; return the error."""
+        """Open the link and check that every drive answers; return the error, if any."""
         try:
             self.link.open()
             yield from self._identify()
@@ -228,7 +228,7 @@ class Drives(abc.ABC):
 
     @abc.abstractmethod
     def _identify(self) -> Procedure[None]:
-        """Request an answer of every drive."""
+        """Check that every drive answers."""
 
     @abc.abstractmethod
     def _request(self, timeout: float) -> float:

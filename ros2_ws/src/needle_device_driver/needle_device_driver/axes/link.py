@@ -1,4 +1,4 @@
-"""Connection to drives, as a component knows it, and its errors."""
+"""Connection to drives as a component uses it, and its errors."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ class LinkError(Exception):
 
 
 class DriveError(Exception):
-    """A drive does not answer, or refuses; the text names the entry and the reason."""
+    """A drive does not answer, or refuses an access; the text names the entry and the reason."""
 
 
 @contextlib.contextmanager
 def raised_as_axis_error(axis: str) -> Iterator[None]:
-    """Raise errors of link and drive as an `AxisError` of this axis."""
+    """Raise link and drive errors as an `AxisError` of this axis."""
     try:
         yield
     except (LinkError, DriveError) as error:
@@ -31,7 +31,7 @@ def raised_as_axis_error(axis: str) -> Iterator[None]:
 class Link:
     """One connection, which can be opened, lost and opened again.
 
-    A lost link stays lost until `open` is called: the drives have missed orders.
+    A lost link stays lost until `open` is called, because the drives have missed orders.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Link:
     lost : str
         Reason why the link was lost; empty: it was not.
     openings : int
-        How often the link was opened.
+        Number of times the link was opened.
     """
 
     _counters: ClassVar[tuple[str, ...]] = ()
@@ -60,7 +60,7 @@ class Link:
 
     @property
     def is_open(self) -> bool:
-        """Whether data pass."""
+        """Whether it is open and not lost."""
         return self._is_open and not self.lost
 
     @property
@@ -69,7 +69,7 @@ class Link:
         return {name: str(getattr(self, name)) for name in self._counters}
 
     def open(self) -> None:
-        """Open the link, also after a loss.
+        """Open the link, or reopen it after a loss.
 
         Raises
         ------
@@ -96,11 +96,11 @@ class Link:
         self._is_open = False
 
     def pop_outgoing(self) -> tuple[Any, ...]:
-        """Return what was sent since the last call."""
+        """Return the data sent since the last call."""
         raise NotImplementedError
 
     def _restart(self) -> None:
-        """Forget what belongs to an earlier opening."""
+        """Discard the state of the earlier connection."""
 
     def _require_open(self) -> None:
         """Raise `LinkError` if the link is closed or lost."""

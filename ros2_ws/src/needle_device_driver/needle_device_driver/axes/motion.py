@@ -16,7 +16,7 @@ class Leg:
     insertion, rotation : float
         Joint positions at its end [m], [rad].
     duration : float
-        At full speed [s].
+        Duration at full speed [s].
     """
 
     insertion: float
@@ -43,7 +43,7 @@ class SetPoint:
 
 
 class CoordinatedMotion:
-    """Motion along legs; one number is the progress of both joints, so they stay in proportion.
+    """Motion along legs; both joints share one progress value, so they stay in proportion.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class CoordinatedMotion:
         return self._set_point(rate)
 
     def follow(self, insertion: float, max_rotation_rate: float, period: float) -> SetPoint:
-        """Return the set-point for an insertion that a hand has reached.
+        """Return the set-point for an insertion that was reached by hand.
 
         The rotation never reverses. Its rate is at most `max_rotation_rate` [rad/s] over the
         `period` [s], so it lags behind a faster push.
@@ -91,7 +91,7 @@ class CoordinatedMotion:
         while True:
             leg = self._legs[self._leg]
             length, whole = leg.insertion - self._start[0], abs(leg.rotation - self._start[1])
-            # A hand may have passed the leg before its rotation began.
+            # The needle may have passed the leg before its rotation began.
             part = (insertion - self._start[0]) / length if length > 0.0 else 1.0
             reached = min(max(part, self._progress), 1.0)
             step = min(reached - self._progress, turn / whole if whole > 0.0 else 1.0)

@@ -9,8 +9,8 @@ from needle_device_driver.axes.axis_settings import AxisSettings
 # Speed bound: this factor times the commanded speed, plus a margin in [m/s] or [rad/s].
 _FACTOR = 1.5
 _MARGINS = {"m": 5e-4, "rad": 0.1}
-# Number of consecutive cycles above the bound that are a fault. A single one is not: a drive that
-# sets its position to 0 at home causes one.
+# Number of consecutive cycles above the bound that count as a fault. One is not enough: it also
+# occurs when a drive sets its position to 0 at home.
 _MAX_FAST_CYCLES = 2
 # Time constant of a motor that lags behind its set-points [s].
 _LONGEST_LAG = 0.2
@@ -22,14 +22,14 @@ class SpeedMonitor:
     Parameters
     ----------
     settings : AxisSettings
-        The axis.
+        Settings of the axis.
     period : float
-        Of a cycle [s].
+        Period of a cycle [s].
 
     Attributes
     ----------
     problem : str
-        How the axis is too fast; empty: it is not.
+        Description of the excessive speed; empty: none.
     """
 
     def __init__(self, settings: AxisSettings, period: float) -> None:
@@ -50,7 +50,7 @@ class SpeedMonitor:
         self._commanded = max(self._commanded, speed)
 
     def check(self, moved: float, periods: int, *, powered: bool) -> bool:
-        """Return whether the axis moved `moved` [m or rad] in some periods at an allowed speed."""
+        """Return whether a motion of `moved` [m or rad] in `periods` cycles was slow enough."""
         settings, commanded = self._settings, self._commanded
         speed = abs(moved) / (periods * self._period)
         bound = _FACTOR * commanded + _MARGINS[settings.unit]

@@ -51,7 +51,7 @@ MO{channels}
 WT 10
 JP #NSIDLE
 """
-# The program has stopped the axes when it is in this line or a later one.
+# The program has stopped the axes once it is at this line or a later one.
 _STOPPED = 5
 _HINT = ": halt the controller's own program (HX) and free its program memory"
 
@@ -71,7 +71,7 @@ class GalilSettings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Expected:
-    """A reply that the controller owes.
+    """A reply expected from the controller.
 
     Attributes
     ----------
@@ -80,9 +80,9 @@ class _Expected:
     asked : bool
         Whether a procedure waits for it.
     axis : str
-        Axis whose fault a refusal is; empty: a refusal is ignored.
+        Axis on which a refusal is reported as a fault; empty: a refusal is ignored.
     number : int
-        Number of a status request; 0: another command.
+        Number of the status request; 0: not a status request.
     """
 
     command: str
@@ -100,7 +100,7 @@ class GalilProtocol(DriveProtocol):
     """All axes of one controller.
 
     A reply says only that a command was accepted (`:`) or refused (`?`), so replies are matched by
-    their order; a status reply, with its number, restores the order if one was lost.
+    their order; a status reply has a number, which restores the order if a reply was lost.
     """
 
     terminators = b":?"
@@ -121,7 +121,7 @@ class GalilProtocol(DriveProtocol):
         if parameters.galil_insertion_channel == parameters.galil_rotation_channel:
             raise UserError("galil_insertion_channel and galil_rotation_channel are the same")
         self._last = list(axes)[-1]
-        # The program stops the axes one or two of its periods before the watchdog's time is over.
+        # The program stops the axes one or two of its periods before the watchdog time expires.
         self._beat = f"nsbeat={round(parameters.watchdog / _COUNTDOWN) - 2}"
         self._expected: deque[_Expected] = deque()
         # Target of an axis in position tracking, and the demanded position on the way there.
@@ -136,7 +136,7 @@ class GalilProtocol(DriveProtocol):
     def identify(self) -> Procedure[str]:
         """Return model and revision; set the format of numbers and of the program's messages."""
         self._expected.clear()
-        # Bit 7 of each character of a message of a program is set.
+        # CW 1 sets bit 7 of each character in the messages of a program.
         yield from self._execute("CW 1")
         yield from self._execute("VF 10.4")
         return (yield from self._execute("\x12\x16"))
@@ -166,7 +166,7 @@ class GalilProtocol(DriveProtocol):
             yield from self._start_watchdog()
 
     def clear_fault(self, axis: str) -> Procedure[None]:
-        """Forget a refusal and a stop code; start a watchdog that has stopped the axes."""
+        """Clear a refusal and a stop code; restart a watchdog that has stopped the axes."""
         self._refusals[axis] = ""
         self._cleared.add(axis)
         if axis == self._last and self._stopped:
@@ -216,7 +216,7 @@ class GalilProtocol(DriveProtocol):
         self._send(self._beat)
 
     def request(self, number: int) -> None:
-        """Ask for positions, switches and stop codes of all axes, the watchdog and the clock."""
+        """Request positions, switches and stop codes of all axes, the watchdog and the clock."""
         of_axes = (f"_TP{at},_RP{at},_TS{at},_SC{at}" for at in self._channels.values())
         self._send(f"MG {number},{','.join(of_axes)},_XQ1,TIME", number=number)
 
@@ -226,7 +226,7 @@ class GalilProtocol(DriveProtocol):
         values = [float(number) for number in _NUMBER.findall(text)]
         requests = [at.number for at in self._expected if at.number]
         if len(values) == 3 + 4 * len(self.axes) and values[0] in requests:
-            # Replies that are missing before this one were lost.
+            # The replies expected before this one were lost.
             while self._expected.popleft().number != values[0]:
                 pass
             self._on_state(list(map(round, values)))
@@ -249,7 +249,7 @@ class GalilProtocol(DriveProtocol):
     def _on_state(self, values: list[int]) -> None:
         number, *states, line, clock = values
         self._stopped = self._armed and line >= _STOPPED
-        # A restart ends the program, or starts the controller's own one, and resets the clock.
+        # A controller restart ends the program, or starts a stored one, and resets the clock.
         self._restarted |= self._armed and (line < 0 or clock < self._clock)
         self._clock = clock
         newer_orders = {at.axis for at in self._expected}
@@ -289,14 +289,14 @@ class GalilProtocol(DriveProtocol):
         yield from self._execute(f"MO{channel}")
 
     def _download(self) -> Procedure[None]:
-        """Replace the controller's program by the watchdog."""
+        """Replace the controller's program with the watchdog."""
         channels = self._channels.values()
         moving = "+".join(f"_BG{channel}" for channel in channels)
         program = _WATCHDOG.format(channels="".join(channels), moving=moving).replace("\n", "\r")
         yield from self._execute("HX1")
         # The controller replies after the backslash, twice.
         yield from self._execute(f"DL\r{program}\\", end="", hint=_HINT)
-        # Data restore the order of the replies.
+        # A reply with data restores the order of the replies.
         yield from self._read("_XQ1")
 
     def _start_watchdog(self) -> Procedure[None]:

@@ -1,4 +1,4 @@
-"""Step/direction board of two stepper motors without encoders: the sketch `stepdir.ino`."""
+"""Step/direction board for two stepper motors without encoders; it runs `stepdir.ino`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from needle_device_driver.polled.polled_drives import polled_backend
 from needle_device_driver.polled.text_link import TextLink
 from needle_device_driver.procedure import Procedure, Wait
 
-# Number of each axis on the board, and fields of an axis in the state.
+# Number of each axis on the board, bits of the state of an axis, and faults.
 _AXES = {"insertion": 0, "rotation": 1}
 _ON, _MOVING, _OUTER, _INNER, _SET_UP = 1, 2, 4, 8, 16
 _DEAD_MAN, _LINE_LOST = 1, 2
@@ -36,12 +36,12 @@ class StepdirSettings:
 
 
 class StepdirProtocol(DriveProtocol):
-    """Language of the board; it numbers its lines, so that the board misses none.
+    """Protocol of the board; the lines are numbered, so that the board detects a lost one.
 
     Parameters
     ----------
     parameters, axes, link
-        As of `DriveProtocol`.
+        As in `DriveProtocol`.
     """
 
     capabilities = Capabilities(
@@ -58,13 +58,13 @@ class StepdirProtocol(DriveProtocol):
     def __init__(self, parameters: Any, axes: Mapping[str, AxisSettings], link: TextLink) -> None:
         super().__init__(parameters, axes, link)
         self._next = 0
-        # Number of a line that asked for the state -> number of the request.
+        # Line number of a state request -> number of the request.
         self._requests: dict[int, int] = {}
         self._max_rate = 0
 
     def identify(self) -> Procedure[str]:
-        """Return name and version; learn the largest step rate."""
-        # A line that was begun before ends here.
+        """Return name and version; store the largest step rate."""
+        # End a partial line that was sent earlier.
         self.link.send(b"\n")
         answer = yield from self._ask("I")
         _, name, version, rate = answer.split(",") if answer.count(",") == 3 else ("", "", "", "")
@@ -117,7 +117,7 @@ class StepdirProtocol(DriveProtocol):
         self._send("B")
 
     def request(self, number: int) -> None:
-        """Ask for the state."""
+        """Request the state."""
         self._requests[self._next] = number
         self._send("S")
 
@@ -136,7 +136,7 @@ class StepdirProtocol(DriveProtocol):
             )
 
     def _ask(self, letter: str, *values: int) -> Procedure[str]:
-        # A line has its number only when it is sent.
+        # Number the line only when it is sent.
         while self._is_asking:
             yield Wait(lambda: not self._is_asking, PERIOD)
         number = self._next

@@ -18,22 +18,22 @@ from needle_device_driver.polled.polled_drives import polled_backend
 from needle_device_driver.polled.text_link import TextLink
 from needle_device_driver.procedure import Procedure
 
-# Since this version a move has its own speed, and a command switches the driver off.
+# First version with a speed in each move, and with a command that switches the driver off.
 _FIRMWARE = (7, 25)
-# In the drive's units: speed [counts/s], and acceleration [counts/s^2].
+# The drive's units of speed [counts/s] and acceleration [counts/s^2].
 _SPEED_UNIT = 1.0 / 1.6384
 _ACCELERATION_UNIT = 1e4 / 1.6384
-# Wide limits until the axis is homed [counts]: until then its position has no meaning.
+# Wide limits for an axis that is not homed: its position has no meaning yet [counts].
 _WIDE = 1_000_000_000
 
-# A move is no slower than this share of the one before: it starts late by the drive's ramp, and the
-# last set-points, which are slow, must make up for that.
+# Smallest ratio of a move's speed to that of the previous move: the drive's ramp delays the motion,
+# and the slow last set-points must make up for it.
 _SLOWING = 0.8
 
-# Message ids: 0 is that of orders, then follow positions, other states and procedures.
+# Number of message ids each for positions, other states and procedures; orders have id 0.
 _CYCLIC_IDS = 33
-# These states change slowly, and a serial line has no time for all: each request asks for the next
-# one. The home switch comes most often, because homing depends on it.
+# These states change slowly, and a serial line is too slow for all of them: each request includes
+# the next one. The home switch is read most often, because homing depends on it.
 _HOME, _AWAY, _WARNINGS = "get limit.home.state", "get limit.away.state", "warnings"
 _SLOW = (_HOME, _AWAY, _HOME, _WARNINGS)
 
@@ -89,11 +89,11 @@ class _Axis:
     position_command : str
         Request for the position: measured if the device has an encoder, else counted.
     offset : int
-        Of the count that moves refer to, from that of the encoder [counts].
+        Count to which moves refer, minus the count of the encoder [counts].
     switches : dict of str to bool
         Request for each limit switch of the device, and whether the switch is active.
     speed : int
-        Of the last move [counts/s].
+        Speed of the last move [counts/s].
     """
 
     target: tuple[int, int]
@@ -110,7 +110,7 @@ class _Axis:
 
 @dataclasses.dataclass
 class _Request:
-    """A request for the states of all axes, with the parts that are missing."""
+    """A request for the states of all axes, with the replies still missing."""
 
     number: int
     missing: dict[tuple[str, int], str] = dataclasses.field(default_factory=dict)
@@ -119,7 +119,7 @@ class _Request:
 class ZaberProtocol(DriveProtocol):
     """ASCII protocol with message ids and checksums.
 
-    A set-point is a point move: the drive ends it by itself. Its speed is that of the set-point.
+    A set-point is sent as a point move at the set-point's speed; the drive ends it by itself.
     """
 
     capabilities = Capabilities(
@@ -166,17 +166,17 @@ class ZaberProtocol(DriveProtocol):
             kind = yield from self._ask((device, 0), "get device.id")
             texts.append(f"device {device}: ID {kind}, firmware {version}")
         self._has_checksums = True
-        # No device that was built has the serial number 0.
+        # No real device has the serial number 0.
         name = "Emulated Zaber" if serials == {"0"} else "Zaber"
         return f"{name}, {', '.join(texts)}"
 
     def set_up(self, axis: str) -> Procedure[None]:
-        """Switch off; set ramps and speed; find out what the device has; set the position."""
+        """Switch off; set ramps and speed; set the position; detect switches and encoder."""
         at, settings = self._axes[axis], self.axes[axis]
         ramp = settings.magnitude(settings.quick_stop_deceleration, _ACCELERATION_UNIT)
         speed = _speed(settings.magnitude(settings.speed))
         yield from self._ask(at.target, "driver disable")
-        # Set-points include the ramps of a move; those of the drive are its quick stop.
+        # The set-points include the ramps of a move; the drive's ramp serves only as quick stop.
         yield from self._ask(at.target, f"set accel {ramp}")
         yield from self._ask(at.target, f"set maxspeed {speed}")
         yield from self.write_limits(axis, -_WIDE, _WIDE)
@@ -186,7 +186,7 @@ class ZaberProtocol(DriveProtocol):
             # Without a reference, a device allows motion in one direction only.
             yield from self._ask(at.target, "set pos 0")
         at.switches = {}
-        # A rotation without a home switch has none: do not spend the time of the line on them.
+        # A rotation that is homed without a switch has no limit switches: save the requests.
         has_ends = settings.unit == "m" or settings.homing_method not in HERE
         for switch in (_HOME, _AWAY) if has_ends else ():
             active = yield from self._ask(at.target, switch, is_optional=True)
@@ -233,7 +233,7 @@ class ZaberProtocol(DriveProtocol):
         self._order(axis, "stop")
 
     def request(self, number: int) -> None:
-        """Ask for all positions and some other states, each with its own message id."""
+        """Request all positions and some other states, each with its own message id."""
         key = 1 + number % _CYCLIC_IDS
         self._requests[key] = request = _Request(number)
         for name, at in self._axes.items():
@@ -294,7 +294,7 @@ class ZaberProtocol(DriveProtocol):
     def _ask(
         self, target: tuple[int, int], text: str, *, is_optional: bool = False
     ) -> Procedure[str]:
-        """Send a command; return its data, or nothing if the device lacks what is optional."""
+        """Send a command; return its data, or an empty text for a refused optional one."""
         self._ask_id = self._ask_id % _CYCLIC_IDS + 1
         message_id = 2 * _CYCLIC_IDS + self._ask_id
         message = _message(target, message_id, text)

@@ -37,7 +37,7 @@ class Cia402Drives(Drives):
     axes : sequence of Cia402Axis
         The axes of all its drives.
     watchdog : float
-        A drive stops after this time without the computer's heartbeat [s].
+        Time without the computer's heartbeat after which a drive stops [s].
     """
 
     def __init__(self, link: FrameLink, axes: Sequence[Cia402Axis], watchdog: float) -> None:

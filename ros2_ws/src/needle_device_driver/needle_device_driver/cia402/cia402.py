@@ -60,7 +60,7 @@ SUPPORTS_CYCLIC_POSITION = 1 << 7
 FAULTS = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 POWERED = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE})
 
-# Transitions that a controlword causes, with their numbers in CiA 402-2. A drive makes 0 and 1
+# Transitions that a controlword causes, with their numbers in CiA 402-2. A drive performs 0 and 1
 # (start), 13 and 14 (fault) by itself.
 _S, _C = DriveState, DriveCommand
 TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
@@ -90,7 +90,7 @@ _STATES = {
     if word & state.value[0] == state.value[1]
 }
 
-# The next command towards a goal. It never acknowledges a fault.
+# Next command towards the goal ON. It never acknowledges a fault.
 _ON = {
     DriveState.SWITCH_ON_DISABLED: DriveCommand.SHUTDOWN,
     DriveState.READY_TO_SWITCH_ON: DriveCommand.SWITCH_ON,
@@ -120,7 +120,7 @@ def next_command(goal: Goal, state: DriveState | None, *, at_rest: bool) -> Driv
     Returns
     -------
     DriveCommand
-        For STOPPED always a quick stop: the statusword may be older than the last command.
+        Always a quick stop for STOPPED: the statusword may be older than the last command.
     """
     if goal is Goal.STOPPED:
         return DriveCommand.QUICK_STOP
@@ -130,16 +130,16 @@ def next_command(goal: Goal, state: DriveState | None, *, at_rest: bool) -> Driv
         if state is DriveState.QUICK_STOP_ACTIVE and not at_rest:
             return DriveCommand.QUICK_STOP
         return _ON.get(state, DriveCommand.DISABLE_VOLTAGE)
-    # A moving axis is stopped before it is switched off: it must not coast.
+    # Stop a moving axis before it is switched off, so that it does not coast.
     is_moving = state is DriveState.QUICK_STOP_ACTIVE and not at_rest
     stop_first = state is DriveState.OPERATION_ENABLED or is_moving
     return DriveCommand.QUICK_STOP if stop_first else DriveCommand.DISABLE_VOLTAGE
 
 
 class TransitionMonitor:
-    """Detects changes of state that no command explains.
+    """Detects state changes that no command explains.
 
-    Commands and statuswords cross on the bus, so the last six commands count, in their order.
+    Commands and statuswords cross on the bus, so the last six commands are considered in order.
     """
 
     def __init__(self) -> None:
@@ -147,13 +147,13 @@ class TransitionMonitor:
         self._state: DriveState | None = None
 
     def note_command(self, command: DriveCommand) -> None:
-        """Note a command that is sent."""
+        """Record a command that is sent."""
         self._sent.append(command)
 
     def unexplained(self, state: DriveState) -> str:
-        """Return which transition to `state` the drive made by itself; empty: none.
+        """Describe a transition to `state` that the drive made by itself; empty: none.
 
-        Faults do not count here: they are reported as such.
+        Faults are excluded because they are reported separately.
         """
         before, self._state = self._state, state
         if before is None or before is state or state in FAULTS or before in FAULTS:

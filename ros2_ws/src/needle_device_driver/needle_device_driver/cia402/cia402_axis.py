@@ -53,7 +53,7 @@ class Cia402Axis(CyclicAxis):
     link : FrameLink
         The bus, shared by all axes.
     watchdog : float
-        The drive stops after this time without the computer's heartbeat [s].
+        Time without the computer's heartbeat after which the drive stops [s].
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Cia402Axis(CyclicAxis):
         Optional objects that the drive lacks.
     """
 
-    # With the units of the drive, after its set-up.
+    # Includes the units of the drive after its set-up.
     _settings: DriveSettings
     _link: FrameLink
     _homing: HomingRun | None
@@ -85,7 +85,7 @@ class Cia402Axis(CyclicAxis):
         return self._settings.node_id
 
     def probe(self) -> Procedure[None]:
-        """Request an answer of the drive, in any state of its node.
+        """Check that the drive answers, in any state of its node.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class Cia402Axis(CyclicAxis):
         self._machine.set_goal(Goal.ON if on else Goal.OFF)
 
     def home(self, speed: float) -> Procedure[None]:
-        """Begin to home; without a motor, the present position becomes 0."""
+        """Begin homing; without a motor, the present position becomes 0."""
         self._refuse_fault()
         if not self.actuated:
             self._count_from_home(self._machine.at.position)
@@ -156,7 +156,7 @@ class Cia402Axis(CyclicAxis):
             try:
                 yield from reset_fault(self._link, self._settings)
             except StuckFaultError:
-                # Frames of the set-up may be lost: let the next reset repeat it.
+                # Frames of the set-up may be lost: make the next reset repeat it.
                 self._opening = 0
                 raise
             yield from self._refresh()
@@ -310,14 +310,14 @@ class Cia402Axis(CyclicAxis):
         yield from await_start(self._link, self.monitor, self._settings, PERIOD)
         yield from arm_watchdog(self._link, self._settings, self._watchdog)
         if self.monitor.rebooted:
-            # The reboot has undone the first part of the set-up.
+            # The reboot undid the first part of the set-up.
             raise DriveError(f"node {self._settings.node_id} rebooted during set-up")
         self.monitor.end_set_up()
         self._opening = self._link.openings
         yield from self._refresh()
 
     def _refresh(self) -> Procedure[None]:
-        """Read the process data by SDO, and discard the state from before."""
+        """Read the process data by SDO, and discard the earlier state."""
         access = self._access
         self.monitor.set_feedback(
             (yield from access.read(od.STATUSWORD)),
@@ -332,7 +332,7 @@ class Cia402Axis(CyclicAxis):
             self.monitor.emergency = (yield from access.read_optional(od.ERROR_CODE)) or None
 
     def _switch_off_now(self) -> Procedure[bool]:
-        """Run own cycles until the drive is off; return whether it is."""
+        """Run separate cycles until the drive is off; return whether it is."""
         if not self.actuated:
             return True
         silent = 0

@@ -1,4 +1,4 @@
-"""Checks from its EDS or DCF file (CiA 306) whether a drive has what the driver's set-up needs."""
+"""Check of a drive's EDS or DCF file (CiA 306) for the objects that the set-up needs."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _MODE_OF_OPERATION, _MODE_DISPLAY, _STATUSWORD = (0x6060, 0), (0x6061, 0), (0x60
 # Values if the file gives none: a CiA 402 drive with a homing mode. Others are 0.
 _ASSUMED = {(0x1000, 0): 402, (0x6502, 0): 1 << 5}
 _SECTION = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?", re.IGNORECASE)
-# Size in bytes of the data types, negative if signed; 0: no number.
+# Size in bytes of the data types, negative if signed; 0: not a number.
 _SIZES = {1: 1, 2: -1, 3: -2, 4: -4, 5: 1, 6: 2, 7: 4, 0x15: -8, 0x1B: 8}
-# Without their number of at most 512.
+# First index of the mappings of up to 512 PDOs.
 _PDO_MAPPINGS = (0x1600, 0x1A00)
 _MISSING, _READ_ONLY, _NOT_MAPPABLE = 0x0602_0000, 0x0601_0002, 0x0604_0041
 _WRONG_LENGTH, _RANGE = 0x0607_0010, 0x0609_0030
@@ -66,7 +66,7 @@ def read_device_file(path: Path, node_id: int) -> tuple[str, dict[Address, FileO
     Raises
     ------
     UserError
-        If the file cannot be read, or is neither.
+        If the file cannot be read, or has neither format.
     """
     parser = configparser.RawConfigParser(
         strict=False, inline_comment_prefixes=(";",), allow_no_value=True
@@ -98,7 +98,7 @@ def _file_object(section: Mapping[str, str | None], node_id: int) -> FileObject:
     def value(key: str) -> int | None:
         number = _number(section.get(key), node_id)
         if number is not None and size < 0 and number >> (8 * -size - 1) == 1:
-            # Hexadecimal text of a negative number.
+            # Hexadecimal two's complement.
             number -= 1 << 8 * -size
         return number
 
@@ -119,7 +119,7 @@ def _number(text: str | None, node_id: int) -> int | None:
 
 
 class FileDevice(SdoClient):
-    """Answers as a drive whose objects are those of a file; it is switched off.
+    """Stand-in for a switched-off drive that has the objects of a file.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class FileDevice(SdoClient):
     Attributes
     ----------
     problems : dict of Address to str
-        The accessed objects in their order, each with the last refusal; empty: none.
+        Last refusal of each accessed object, in the order of access; empty: none.
     granted : set of Address
         Objects that accept everything.
     ignored : set of Address
@@ -144,7 +144,7 @@ class FileDevice(SdoClient):
         self._values: dict[Address, int] = {}
 
     def restart(self) -> None:
-        """Restore the values of the file, and forget the accesses."""
+        """Restore the values of the file, and clear the record of accesses."""
         self.problems, self._values = {}, {_STATUSWORD: 0}
 
     def upload(self, index: int, subindex: int) -> Procedure[bytes]:
@@ -193,7 +193,7 @@ class FileDevice(SdoClient):
 
 
 class FileLink(FrameLink):
-    """A bus with one drive, which a file describes.
+    """A bus with one drive that is described by a file.
 
     Parameters
     ----------
@@ -233,9 +233,9 @@ class ObjectRow:
     rule, name : str
         The rule that needs it; its address and name.
     problem : str
-        Why the drive refuses it; empty: it does not.
+        Reason why the drive refuses it; empty: accepted.
     is_fatal : bool
-        Whether the drive is therefore not usable.
+        Whether this makes the drive unusable.
     """
 
     rule: str
@@ -247,7 +247,7 @@ class ObjectRow:
 def check_device_file(
     path: Path, settings: DriveSettings, watchdog: float
 ) -> tuple[str, list[ObjectRow], tuple[str, ...]]:
-    """Run the driver's set-up against a file; after a refusal, assume consent and run it again.
+    """Run the driver's set-up against a file; repeat it as if the drive had granted each refusal.
 
     Parameters
     ----------
@@ -256,21 +256,21 @@ def check_device_file(
     settings : DriveSettings
         Settings of the drive.
     watchdog : float
-        Of the driver [s].
+        Watchdog time of the driver [s].
 
     Returns
     -------
     str
         The product's name.
     list of ObjectRow
-        What the set-up accesses.
+        Objects that the set-up accesses.
     tuple of str
-        What the driver will report as missing or assumed.
+        Missing objects and assumptions that the driver will report.
 
     Raises
     ------
     UserError
-        If the file is neither, or describes no CiA 402 drive.
+        If the file has neither format, or its drive is not CiA 402.
     """
     product, objects = read_device_file(path, settings.node_id)
     device = FileDevice(objects)

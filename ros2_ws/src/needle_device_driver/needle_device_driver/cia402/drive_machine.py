@@ -1,4 +1,4 @@
-"""Takes a drive through its CiA 402 states to a goal state, cycle by cycle."""
+"""Control of a drive through its CiA 402 states to a goal state, cycle by cycle."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from needle_device_driver.cia402.cia402 import (
 )
 from needle_device_driver.cia402.drive_monitor import Feedback
 
-# All in cycles. An axis is at rest after it stood still for:
+# All in cycles. An axis is at rest after standing still for this time.
 _REST = 3
 # A stopped axis is switched off after this time even if it is not at rest.
 MAX_REST = 50
@@ -40,9 +40,9 @@ class DriveMachine:
     Parameters
     ----------
     rest_counts : int
-        An axis stands still in a cycle if it moves no farther.
+        Largest motion per cycle of an axis at rest [counts].
     period : float
-        Of a cycle [s].
+        Period of a cycle [s].
     stop_time : float
         Longest time of a quick stop [s].
     at : Feedback
@@ -51,13 +51,13 @@ class DriveMachine:
     Attributes
     ----------
     mode : Mode
-        Wanted mode of operation.
+        Requested mode of operation.
     at : Feedback
         Newest process data of the drive.
     target : int
         Set-point of the drive [counts].
     problem : str
-        What is wrong with the drive; empty: nothing.
+        Problem with the drive; empty: none.
     """
 
     def __init__(self, rest_counts: int, period: float, stop_time: float, at: Feedback) -> None:
@@ -97,7 +97,7 @@ class DriveMachine:
 
     @property
     def powered(self) -> bool:
-        """Whether the drive is on by the present order, moving or stopped."""
+        """Whether the drive is on because of the present order, moving or stopped."""
         # Excludes a drive that is still on from before, or in another mode.
         on = self.state in POWERED and self.at.mode == self.mode
         return self._goal is not Goal.OFF and (on or self._via_off)
@@ -109,10 +109,10 @@ class DriveMachine:
 
     @property
     def stop_failure(self) -> str:
-        """Report on a drive that moves or has power long after the goal OFF; otherwise empty."""
+        """Description of a drive that moves or has power long after goal OFF; empty: none."""
         powered = self.state in (*POWERED, DriveState.FAULT_REACTION_ACTIVE)
         late = self._cycles > self._max_stop + _WINDOW
-        # A hand may move an axis without power that has come to rest before.
+        # An axis that has come to rest without power may be moved by hand.
         moving = late and self._keeps_moving and (powered or not self._rested)
         failures = ["powered"] * (powered and self._cycles > MAX_REST) + ["moving"] * moving
         return f"still {' and '.join(failures)}" if failures and self._goal is Goal.OFF else ""
@@ -129,14 +129,14 @@ class DriveMachine:
     def set_goal(self, goal: Goal) -> None:
         """Set the goal."""
         if goal is not self._goal:
-            # A released axis is switched on again: it has not lost its power.
+            # A released axis still counts as powered while it is switched on again.
             self._via_off = self.released_after_block and goal is Goal.ON
             self._goal = goal
             self._cycles = 0
             self._rested = False
 
     def stop(self) -> None:
-        """Order a quick stop; nothing else is ordered until the drive has confirmed it."""
+        """Request a quick stop; no other command is sent until the drive confirms it."""
         if self._goal is not Goal.OFF:
             self.set_goal(Goal.STOPPED)
         self._stopping = True
@@ -184,7 +184,7 @@ class DriveMachine:
 
     @property
     def _keeps_moving(self) -> bool:
-        """Whether the axis leaves its place; jitter around it does not count."""
+        """Whether the axis keeps moving; jitter around a fixed position does not count."""
         track = self._track
         return len(track) > _WINDOW and abs(track[-1] - track[0]) > _WINDOW * self._rest_counts
 
@@ -225,7 +225,7 @@ class DriveMachine:
             and self._still_cycles >= _REST
             and abs(self.at.following_error) > self._rest_counts
         ):
-            # The axis is blocked: its drive would move it as soon as it comes free.
+            # The axis is blocked: the drive would move it as soon as it is freed.
             self._via_off = True
         if self.switching and state not in FAULTS and self._cycles > _MAX_SWITCHING:
             self._runs_on = self._runs_on or self._goal is not Goal.ON

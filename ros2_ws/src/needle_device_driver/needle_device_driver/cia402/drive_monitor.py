@@ -37,14 +37,14 @@ class Feedback:
     number : int
         Number of complete answers to a SYNC.
     statusword, mode, inputs : int
-        As sent.
+        Values as sent.
     position : int
         Position actual value [counts].
     following_error : int
-        Demand of the drive's controller minus position [counts]; 0 if the drive does not report
+        Position demand of the drive minus position [counts]; 0 if the drive does not report
         it.
     syncs : int
-        Number of SYNCs that were sent before it arrived.
+        Number of SYNCs that were sent before the data arrived.
     time : float
         Steady time of its arrival [s].
     """
@@ -72,10 +72,10 @@ class DriveMonitor:
     """Receives the frames of one node and measures their age.
 
     The age of process data counts from its arrival. If it answers the last SYNC, nothing newer was
-    requested, and each heartbeat renews it: positions stay fresh while the time of a simulation
-    stands still, and become stale as soon as a SYNC is unanswered.
+    requested, and each heartbeat renews it: positions stay fresh while simulated time stands still,
+    and become stale as soon as a SYNC is unanswered.
 
-    An answer does not name its SYNC, so the monitor counts them. While two earlier SYNCs are
+    An answer does not identify its SYNC, so the monitor counts them. While two earlier SYNCs are
     unanswered, an answer counts as late and renews nothing. A pause without SYNCs shows which
     answers are lost.
 
@@ -133,12 +133,12 @@ class DriveMonitor:
         return self._is_set_up and self._nmt_state != NMT_OPERATIONAL
 
     def answered(self) -> bool:
-        """Return whether the answer to the last SYNC is complete, and not a late one."""
+        """Return whether the answer to the last SYNC is complete and not late."""
         return not self._is_waiting
 
     @property
     def outstanding(self) -> int:
-        """Number of unanswered SYNCs if more than one before the last is; otherwise 0."""
+        """Number of unanswered SYNCs, or 0 if at most one before the last is unanswered."""
         return self._syncs - min(self._received.values()) if self._is_behind else 0
 
     def discard_outstanding(self) -> None:
@@ -172,7 +172,7 @@ class DriveMonitor:
     def set_feedback(self, statusword: int, mode: int, inputs: int, position: int) -> None:
         """Use values that were read by SDO as the newest process data.
 
-        Some drives answer a SYNC with data from the SYNC before. So the next answer counts as an
+        Some drives answer a SYNC with data from the previous SYNC. So the next answer counts as an
         answer, but its data are older than these values.
         """
         self._answers = set(_ANSWER)
@@ -185,7 +185,7 @@ class DriveMonitor:
         )
 
     def await_operational(self, before: int, timeout: float) -> Procedure[bool]:
-        """Wait for a heartbeat after the first `before`; return whether it reports operational."""
+        """Wait for more than `before` heartbeats; return whether the last reports operational."""
         yield Wait(lambda: self.heartbeats > before, timeout)
         return self.heartbeats > before and self._nmt_state == NMT_OPERATIONAL
 
@@ -196,7 +196,7 @@ class DriveMonitor:
     @property
     def _is_behind(self) -> bool:
         outstanding = self._syncs - min(self._received.values())
-        # The answer to the last SYNC may be under way.
+        # The answer to the last SYNC may still be in transit.
         return outstanding - (len(self._answers) < len(_ANSWER)) > _MAX_MISSING
 
     def _answer(self, function_code: int, time: float) -> None:

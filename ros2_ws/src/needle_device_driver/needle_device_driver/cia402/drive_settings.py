@@ -13,7 +13,7 @@ from needle_device_driver.link import objects as od
 from needle_device_driver.link.object_access import ObjectAccess, ObjectError
 from needle_device_driver.procedure import Procedure
 
-# Homing methods with an index pulse, and to a switch.
+# Homing methods that use an index pulse, and a switch.
 INDEX_PULSE = (*range(1, 15), 33, 34)
 SWITCHES = tuple(range(1, 15)) + tuple(range(17, 31))
 HOMING_METHODS = (*SWITCHES, 33, 34, *HERE)
@@ -30,7 +30,7 @@ class DriveSettings(AxisSettings):
     following_error_time : float
         Time for which the drive tolerates a greater following error [s].
     max_torque : float
-        Share of the rated torque; 0: the drive's own setting.
+        Largest share of the rated torque; 0: the drive's own setting.
     counts_per_turn : float
         Position counts per turn of the drive's shaft; 0: as the drive reports, or unknown.
     speed_unit, ramp_unit : float
@@ -50,7 +50,7 @@ class DriveSettings(AxisSettings):
         Raises
         ------
         UserError
-            A value out of bounds, or an unknown homing method.
+            If a value is out of bounds or the homing method is unknown.
         """
         super().__post_init__()
         if self.homing_method not in HOMING_METHODS:
@@ -91,20 +91,20 @@ def read_units(
     access : ObjectAccess
         The drive.
     settings : DriveSettings
-        Its settings; a `counts_per_turn` above 0 replaces 0x608F and 0x6091.
+        Settings of the drive; a `counts_per_turn` above 0 replaces 0x608F and 0x6091.
 
     Returns
     -------
     DriveSettings
-        With units of counts/s or rpm, with any prefix; by default counts/s.
+        Settings with units of counts/s or rpm, with any prefix; by default counts/s.
     str
         Units that the drive does not report, and the assumed ones; empty: none.
 
     Raises
     ------
     DriveError
-        If positions are not in counts, a unit is another one, or the counts per turn are missing or
-        inconsistent.
+        If positions are not in counts, another unit is not accepted, or the counts per turn are
+        missing or inconsistent.
     LinkError
         If the link is lost.
     """
@@ -123,7 +123,7 @@ def read_units(
         "home it without a needle first (docs/hardware.md)"
     )
     speed = speed or 1.0
-    # Only the bound of a homing to an index pulse needs the turn.
+    # The counts per turn are only needed to bound a homing to an index pulse.
     turn = 0.0
     if settings.homing_method in INDEX_PULSE:
         turn = yield from _counts_per_turn(access, settings)

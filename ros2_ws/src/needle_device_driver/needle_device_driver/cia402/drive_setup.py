@@ -24,10 +24,10 @@ from needle_device_driver.procedure import Procedure
 
 # Milliseconds between a drive's heartbeats: much shorter than the reply age limit.
 PRODUCER_HEARTBEAT_MS = 30
-# Longest accepted period if the drive's own is fixed: the driver waits for these heartbeats when a
-# drive starts, and while it stands still.
+# Longest accepted heartbeat period if a drive refuses the one above: the driver waits for
+# heartbeats when a drive starts, and while it stands still.
 _MAX_HEARTBEAT_MS = 200
-# In seconds.
+# Time-outs [s].
 _SWITCH_OFF_TIMEOUT = 1.0
 _MODE_TIMEOUT = 0.5
 # Two of the four transmit PDOs that CiA 402 drives have by default; they may be on.
@@ -53,25 +53,25 @@ def set_up(
     link : FrameLink
         The bus, open.
     monitor : DriveMonitor
-        The drive's; a reboot after the drive's first answer voids the set-up.
+        Monitor of the drive; a reboot after its first answer voids the set-up.
     settings : DriveSettings
-        The wanted settings.
+        The requested settings.
     period : float
-        Of the SYNC [s].
+        SYNC period [s].
     homed : bool
         Whether the position counts from home, as the software limits do.
 
     Returns
     -------
     DriveSettings
-        As given, with the units of the drive.
+        The given settings, with the units of the drive.
     tuple of str
-        What the drive lacks of the optional objects.
+        Optional objects that the drive lacks, and assumptions.
 
     Raises
     ------
     DriveError
-        If the node does not answer, is no CiA 402 drive, or lacks a required object.
+        If the node does not answer, is not a CiA 402 drive, or lacks a required object.
     LinkError
         If the link is lost.
     """
@@ -108,7 +108,7 @@ def set_up(
 
 
 def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) -> Procedure[None]:
-    """Write the drive's software limits; without home, which they count from, none."""
+    """Write the drive's software limits, which count from home; before homing, disable them."""
 
     def write(lower: int, upper: int) -> Procedure[None]:
         yield from access.write_checked(od.LOWER_LIMIT, lower, variable=True)
@@ -119,7 +119,7 @@ def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) 
 
 
 def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) -> Procedure[None]:
-    """Write the speeds of a homing; `speed` [unit/s] is at least one of the drive's units."""
+    """Write the homing speeds; `speed` [unit/s] must be at least one of the drive's units."""
     if speed * settings.counts_per_unit < settings.speed_unit:
         raise DriveError(f"homing at {speed:g}/s is less than one speed unit of the drive")
     yield from access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed, settings.speed_unit))
@@ -147,7 +147,7 @@ def _set_up_motion(
     ramp = settings.magnitude(settings.acceleration, settings.ramp_unit)
     stop_ramp = settings.magnitude(settings.quick_stop_deceleration, settings.ramp_unit)
     # Objects that a drive may lack: value, and if a rule depends on the object, the least and
-    # greatest accepted value after rounding by the drive. Any other value was clipped.
+    # greatest accepted value after rounding by the drive. A value outside them was clipped.
     wanted: list[tuple[od.Entry, int, tuple[int, int] | None]] = [
         # Stop on ramps, never coast; a missing heartbeat is a fault, which latches.
         (od.SHUTDOWN_OPTION, 1, None),
@@ -178,7 +178,7 @@ def _set_up_motion(
 def _write_wanted(
     access: ObjectAccess, entry: od.Entry, value: int, accepted: tuple[int, int] | None
 ) -> Procedure[str]:
-    """Write an object; return what the drive lacks. It may refuse one that no rule depends on."""
+    """Write an object; return a note if it is missing, or refused and not needed by a rule."""
     try:
         if accepted is None:
             yield from access.write(entry, value)
@@ -194,7 +194,7 @@ def _write_wanted(
 
 
 def _switch_off(link: FrameLink, access: ObjectAccess, settings: DriveSettings) -> Procedure[None]:
-    """Switch a powered drive off: it may refuse settings."""
+    """Switch a powered drive off, because it may refuse settings."""
     if drive_state((yield from access.read(od.STATUSWORD))) not in POWERED:
         return
     yield from access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
@@ -205,7 +205,7 @@ def _switch_off(link: FrameLink, access: ObjectAccess, settings: DriveSettings) 
 
 
 def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[None]:
-    """Check that a drive, which is off, has both modes.
+    """Check that a switched-off drive has both modes.
 
     Without 0x6502 each mode is tried. Cyclic synchronous position is also tried if 0x6502 does not
     list it, because an EPOS4 supports it without listing it.
@@ -233,7 +233,7 @@ def _try_mode(link: FrameLink, access: ObjectAccess, node: int, mode: Mode) -> P
 
 
 def _write_homing_method(access: ObjectAccess, method: int) -> Procedure[None]:
-    # The standard's older edition has another number, 35, for "where it stands".
+    # An older edition of the standard uses 35 for homing at the present position.
     others = [other for other in HERE if other != method] if method in HERE else []
     yield from _first_accepted(access.write(od.HOMING_METHOD, one) for one in (method, *others))
 
@@ -254,7 +254,7 @@ def _write_heartbeat(access: ObjectAccess) -> Procedure[None]:
 def _map_optional(
     access: ObjectAccess, node: int, full: Pdo, without: Pdo, missing: str
 ) -> Procedure[list[str]]:
-    """Map a PDO, without its last entry if the drive lacks it; return what it lacks."""
+    """Map a PDO, without its last entry if the drive lacks it; return a note if so."""
     try:
         if (yield from access.read_optional(full.entries[-1])) is not None:
             yield from _map_pdo(access, node, full)
@@ -292,7 +292,7 @@ def _map_pdo(access: ObjectAccess, node: int, pdo: Pdo) -> Procedure[None]:
 
 
 def _switch_off_unused_pdos(access: ObjectAccess) -> Procedure[None]:
-    """Switch the other transmit PDOs off, which may send on each change and load the bus."""
+    """Switch off the other transmit PDOs, which may send on each change and load the bus."""
     for communication in _UNUSED_PDOS:
         cob_id = _cob_id(communication)
         before = yield from access.read_optional(cob_id)

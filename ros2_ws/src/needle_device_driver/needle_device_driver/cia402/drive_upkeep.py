@@ -1,4 +1,4 @@
-"""Procedures with a drive before and after its set-up: identity, start, watchdog, fault reset."""
+"""Procedures before and after the set-up of a drive: identity, start, watchdog, fault reset."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutError
 from needle_device_driver.procedure import Procedure
 
-# In seconds.
+# Time-outs [s].
 _HEARTBEAT_TIMEOUT = 0.3
 _START_TIMEOUT = 1.0
 _FAULT_RESET_TIMEOUT = 1.0
@@ -61,7 +61,7 @@ def await_operational(
     """Return whether the drive reports operational; meanwhile send the computer's heartbeat."""
     until = link.now + timeout
     while link.now < until:
-        # The drive may answer at once.
+        # Count first: the drive may answer at once.
         before = monitor.heartbeats
         link.beat()
         if (yield from monitor.await_operational(before, period)):
@@ -87,7 +87,7 @@ def await_start(
 
 
 def arm_watchdog(link: FrameLink, settings: DriveSettings, watchdog: float) -> Procedure[None]:
-    """Let the drive stop after `watchdog` [s] without the computer's heartbeat; raises as `set_up`.
+    """Arm the drive's stop after `watchdog` [s] without a heartbeat; raises as `set_up`.
 
     It is the last step of a set-up: from here on the loop must send its heartbeat.
     """
@@ -104,9 +104,9 @@ def disarm_watchdog(link: FrameLink, settings: DriveSettings) -> Procedure[None]
 
 
 def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
-    """Acknowledge a drive's fault and wait until it is gone; moves nothing.
+    """Acknowledge a drive's fault and wait until it clears; moves nothing.
 
-    The drive is operational, so the controlword goes by PDO: many drives then reject it by SDO.
+    The controlword is sent by PDO, because many operational drives reject it by SDO.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
     StuckFaultError
         If the drive stays in its fault.
     DriveError
-        If it does not answer, or still has power: it is stopping.
+        If it does not answer, or still has power because it is stopping.
     LinkError
         If the link is lost.
     """

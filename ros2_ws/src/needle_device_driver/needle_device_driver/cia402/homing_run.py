@@ -17,9 +17,9 @@ from needle_device_driver.cia402.drive_monitor import Feedback
 from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSettings
 from needle_device_driver.link import objects as od
 
-# A drive may report that it attained the previous homing. If the new one ends within a cycle, where
-# the axis stands or at the edge of its switch, no change shows. So it counts as ended after this
-# number of cycles at its home: for a homing where it stands, and for one to a switch.
+# A drive may still report the previous homing as attained. If the new one ends within a cycle, at
+# the present position or the edge of the switch, the report does not change. So it counts as ended
+# after this number of cycles at home: for homing at the present position, and for one to a switch.
 _CYCLES_HERE, _CYCLES_AT_SWITCH = 5, 25
 # Methods that end at a limit switch: its direction in counts, its bit of the digital inputs.
 _TOWARDS = {17: (-1, od.NEGATIVE_LIMIT_SWITCH), 18: (1, od.POSITIVE_LIMIT_SWITCH)}
@@ -42,7 +42,7 @@ class HomingRun:
     settings : DriveSettings
         The drive.
     speed : float
-        Towards the switch [m/s or rad/s].
+        Speed towards the switch [m/s or rad/s].
     has_inputs : bool
         Whether the drive reports its limit switches.
 
@@ -51,7 +51,7 @@ class HomingRun:
     step : HomingStep
         Stage of the homing.
     problem : str
-        Why it must not continue; empty: it may.
+        Reason to abort the homing; empty: none.
     """
 
     def __init__(self, settings: DriveSettings, speed: float, *, has_inputs: bool) -> None:
@@ -68,7 +68,7 @@ class HomingRun:
         self.step = HomingStep.PREPARING
 
     def update(self, at: Feedback, moved: int) -> None:
-        """Handle the newest answer, and the motion since the one before [counts]."""
+        """Handle the newest answer, and the motion since the previous one [counts]."""
         attained = bool(at.statusword & HOMING_ATTAINED)
         ended = attained and bool(at.statusword & TARGET_REACHED)
         if self.step is HomingStep.PREPARING:

@@ -1,4 +1,4 @@
-"""Checks of emulated drives: their states, a whole step, and orders past the driver."""
+"""Checks of emulated drives: their states, a whole step, and orders that bypass the driver."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from needle_device_driver.procedure import Procedure
 STEP_TIME = 0.41
 """Duration of a step of 2 mm at nearly the largest speed [s]."""
 TIGHT = 50e-6
-"""Software limits around home for an order beyond them [m]."""
+"""Software limits on either side of home, for an order beyond them [m]."""
 _OFF = ("OFF", "SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON", "SWITCHED_ON")
 
 
@@ -54,6 +54,6 @@ def check_step(rig: ConformanceRig) -> None:
 
 
 def are_off(rig: ConformanceRig, *others: str) -> bool:
-    """Return whether the state of each emulated drive begins as `_OFF` or another text."""
+    """Return whether the state of each emulated drive begins with one of `_OFF` or `others`."""
     states = [s for drives in rig.drives.connections.values() for s in drives.states().values()]
     return all(state.startswith((*_OFF, *others)) for state in states)

@@ -1,4 +1,4 @@
-"""Events that must stop the needle: which rule then counts, and how far the needle may move."""
+"""Events that must stop the needle, with the rule that stops it and the allowed travel."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Fault(NamedTuple):
     rule : Rule
         The rule that stops the needle.
     event : callable
-        Causes it.
+        Causes the event.
     delay : str
-        What passes until the drives are ordered to stop, or stop by themselves; a key of `_delays`.
+        Delay until the drives are ordered to stop, or stop by themselves; a key of `_delays`.
     causes : tuple of Rule
         Other rules that may name the cause in the log.
     in_steps : bool
-        Whether the rule counts in steps only, not in a homing.
+        Whether the rule applies to steps only, not to homing.
     """
 
     name: str
@@ -102,7 +102,7 @@ def can_keep(rule: Rule, drive: Capabilities) -> bool:
 
 
 def _delays(drive: Capabilities, limits: Any) -> dict[str, float]:
-    """Return the longest times [s]."""
+    """Return the longest delay of each kind [s]."""
     return {
         "none": 0.0,
         "hold": HOLD_LIFETIME + PERIOD,
@@ -123,7 +123,7 @@ def largest_travel(fault: Fault, drive: Capabilities, limits: Any) -> Travel:
     drive : Capabilities
         Abilities of the drives.
     limits : DeviceDriverParameters
-        The driver's.
+        Parameters of the driver.
     """
     seconds = _delays(drive, limits)[fault.delay] + PERIOD + drive.response_time
     rows = (

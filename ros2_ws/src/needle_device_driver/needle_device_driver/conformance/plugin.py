@@ -1,4 +1,4 @@
-"""Options of pytest for the conformance kit, and its table of rules by drive."""
+"""Options of the conformance kit for pytest, and its table of rules by drive."""
 
 from __future__ import annotations
 

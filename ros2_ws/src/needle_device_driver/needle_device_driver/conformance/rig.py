@@ -40,7 +40,7 @@ DRIVER = DeviceDriver.name
 AXES = ("insertion", "rotation")
 AT_REST = (1e-6, 1e-4)
 """Largest motion of motors at rest [m], [rad]: encoder counts."""
-# Counts per m and rad that every kind of drive can make at the largest speed.
+# Counts per m and rad that every kind of drive supports at the largest speed.
 _COUNTS = {"insertion_counts_per_unit": 2.0e6, "rotation_counts_per_unit": 3000.0}
 _JOINT_NAMES = (m.INSERTION_JOINT, m.ROTATION_JOINT)
 _TIMEOUT = 60.0
@@ -70,7 +70,7 @@ class RigClient(Component):
     Parameters
     ----------
     steers : bool
-        Whether it sends commands; the driver rejects commands of two publishers.
+        Whether it sends commands; the driver rejects commands from two publishers.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class RigClient(Component):
     joints : tuple of float
         Last joint positions [m], [rad]; rotation is 0 after homing.
     results : dict of int to str
-        Stamp of a command to its outcome.
+        Outcome of each command by its stamp.
     """
 
     name = "hand"
@@ -132,17 +132,17 @@ class ConformanceRig:
     Parameters
     ----------
     seed : int
-        Of the runner.
+        Seed of the runner.
     *others : Component
         Further components.
     axis : str
-        Kind of the drives of both axes, with counts that each kind can make; by default cia402.
+        Kind of drive of both axes, with counts that every kind supports; by default cia402.
     hand : RigClient, optional
         The client.
     driver, drives : mapping, optional
         Parameters of driver and emulated drives.
     faults : sequence of Fault
-        The runner's.
+        Faults of the runner.
 
     Attributes
     ----------
@@ -164,7 +164,7 @@ class ConformanceRig:
         drives: Mapping[str, Any] | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
-        # By its name: the drives' emulators share no code with the driver.
+        # Imported by name: the emulators share no code with the driver.
         emulator = import_module("needle_sim.drive_emulator")
         self.hand = hand or RigClient()
         self.logged: list[str] = []
@@ -196,7 +196,7 @@ class ConformanceRig:
         self.until(lambda: self.state == "DISABLED", "the driver")
 
     def begin_homing(self) -> None:
-        """Begin to home both axes, the needle being out."""
+        """Begin homing both axes with the needle out."""
         self.start()
         self.call("device/confirm_needle_out", True)
         self.call("device/home")
@@ -208,7 +208,7 @@ class ConformanceRig:
         self.call("device/enable", True)
 
     def hold(self, pressed: bool) -> None:
-        """Press or release."""
+        """Press or release the hold."""
         self.hand.held = Held(pressed)
 
     def press(self) -> None:
@@ -290,7 +290,7 @@ class ConformanceRig:
         return axes["insertion"].position, axes["rotation"].position
 
     def behind(self, axis: str) -> Any:
-        """Return the emulated drives of an axis; they have the faults."""
+        """Return the emulated drives of an axis, which can be made to fail."""
         return next(one for one in self.drives.connections.values() if axis in one.motors)
 
     @property
@@ -304,12 +304,12 @@ class ConformanceRig:
 
     @property
     def insertion_protocol(self) -> Any:
-        """Language of the insertion drive; None for CiA 402."""
+        """Protocol of the insertion drive; None for CiA 402."""
         drives = next(one for one in self.driver.drives if "insertion" in one.axes)
         return getattr(drives, "protocol", None)
 
     def distance(self, begin: tuple[float, float]) -> tuple[float, float]:
-        """Return how far the motors are from places [m], [rad]; 0: at rest."""
+        """Return the distance of the motors from a position [m], [rad]; 0: at rest."""
         ways = (abs(here - there) for here, there in zip(self.place, begin, strict=True))
         settings = self.settings
         counts = settings.insertion_counts_per_unit, settings.rotation_counts_per_unit
@@ -330,12 +330,12 @@ class ConformanceRig:
         return all(way <= most for way, most in zip(travel, AT_REST, strict=True))
 
     def fails(self, rule: Rule) -> bool:
-        """Return whether the device is in FAULT by a rule, and nothing moves."""
+        """Return whether the device is in FAULT because of a rule, and nothing moves."""
         self.runner.run(0.3)
         return self.is_at_rest() and self.is_logged(rule) and self.state == "FAULT"
 
     def travel(self, event: Callable[[], object], seconds: float) -> tuple[float, float]:
-        """Return how far the motors get from their places at an event [m], [rad]."""
+        """Return the largest distance that the motors move after an event [m], [rad]."""
         begin, end = self.place, self.runner.now + seconds
         farthest = (0.0, 0.0)
         event()

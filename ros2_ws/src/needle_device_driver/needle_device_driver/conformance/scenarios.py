@@ -21,11 +21,11 @@ MakeRig = Callable[..., ConformanceRig]
 """Makes a rig with the drives under test; keywords `driver` and `drives` are parameters."""
 NO_TRAVEL = (0.0, 0.0)
 IMPOSSIBLE = "not possible"
-# Longest time after a fault until nothing moves and the driver has named the cause [s].
+# Longest time after a fault until nothing moves and the driver has logged the cause [s].
 _STOPPED = 1.5
 _DEEP, _SHALLOW = 0.1, 0.02
 _RETRACT_AT = 0.003
-# Motion by another computer until it is noticed [m].
+# Motion ordered by another computer until detection [m].
 _INTRUSION = 0.001
 # Constant delay of replies that only slows a motion down [s].
 _LATE = 0.03
@@ -43,7 +43,7 @@ def random_moment(fault: Fault, make: MakeRig, seed: int) -> None:
 
 
 def _proceed(rig: ConformanceRig) -> None:
-    """Do what leads to the next step or retraction."""
+    """Take the next action towards a step or retraction."""
     status = rig.hand.status
     match status.state, status.homed, status.activity:
         case "DISABLED", False, _:
@@ -60,7 +60,7 @@ def _proceed(rig: ConformanceRig) -> None:
 
 
 def _stop_by(fault: Fault, rig: ConformanceRig) -> None:
-    """Cause a fault: the motors stop in time, the cause is named, and nothing moves later."""
+    """Cause a fault: the motors stop in time, the cause is logged, and nothing moves later."""
     activity = rig.hand.status.activity
     travel = rig.travel(lambda: fault.event(rig), _STOPPED)
     bound = largest_travel(fault, rig.capabilities, rig.settings)
@@ -94,16 +94,16 @@ def _later_motion(rig: ConformanceRig) -> Travel:
 
 
 def no_motion_by_itself(make: MakeRig) -> None:
-    """Set up, connect anew, reset, switch on and off, also after a step: nothing moves.
+    """Set up, reconnect, reset, switch on and off, also after a step: nothing moves.
 
-    Set-up and the end of the driver leave the drives off.
+    The drives are off after set-up and after the driver ends.
     """
     rig = make(drives={"insertion_start": 0.01})
     begin = rig.place
     was_off = False
     while rig.state != "DISABLED":
         rig.runner.run(PERIOD / 4.0)
-        # A drive may be on when it gets power, until its set-up.
+        # A drive may be on from its power-up until its set-up.
         is_off = checks.are_off(rig)
         assert is_off or not was_off
         was_off = is_off
@@ -127,7 +127,7 @@ def no_motion_by_itself(make: MakeRig) -> None:
     rig = make()
     rig.ready()
     rig.runner.stop(DRIVER)
-    # The first run ends with the driver.
+    # The first run returns when the driver ends.
     rig.until(lambda: not rig.runner.runs(DRIVER), "the end of the driver")
     rig.runner.run(1.0)
     assert checks.are_off(rig)
@@ -157,7 +157,7 @@ def reply_age(make: MakeRig) -> None:
 def quick_stop(make: MakeRig) -> None:
     """Release while an axis is blocked, and free it: it does not move to the old target.
 
-    A stop ends an order that lasts longer than a cycle.
+    A stop also ends an order that lasts longer than a cycle.
     """
     assert checks.order_directly(make, stops=True) < checks.TIGHT
     rig = make()
@@ -258,7 +258,7 @@ def axis_speed(make: MakeRig) -> None:
 
 
 def software_limits(make: MakeRig) -> None:
-    """Order a set-point beyond the limits: the driver refuses it, and so does the drive."""
+    """Order a set-point beyond the limits: both the driver and the drive refuse it."""
     rig = make()
     if rig.capabilities.limits:
         assert checks.order_directly(make, stops=False) < 2.0 * checks.TIGHT
@@ -274,7 +274,7 @@ def software_limits(make: MakeRig) -> None:
 
 
 def one_master(make: MakeRig) -> None:
-    """Let another computer interfere at rest: the driver notices it."""
+    """Interfere as another computer at rest: the driver detects it."""
     rig = make()
     rig.ready()
     begin = rig.place
@@ -284,7 +284,7 @@ def one_master(make: MakeRig) -> None:
 
 
 def drive_reboot(make: MakeRig) -> None:
-    """Restart a drive faster than the driver misses a reply: it is no longer homed."""
+    """Restart a drive before the driver misses a reply: it is no longer homed."""
     rig = make(drives={"boot_time": 0.05})
     rig.ready()
     drives = rig.behind("rotation")
@@ -327,13 +327,13 @@ SCENARIOS: dict[Rule, Callable[[MakeRig], None]] = {
         *(drive_watchdog, loop_heartbeat),
     )
 }
-"""Rule to its scenario."""
+"""Scenario of each rule."""
 RULES = tuple(rule for rule in Rule if rule in {*SCENARIOS, *(fault.rule for fault in FAULTS)})
 """Rules that depend on the drives."""
 
 
 def verdict(rule: Rule, drive: Capabilities, limits: Any) -> str:
-    """Return how drives keep a rule: enforced, with which bound, or not at all.
+    """Return how drives keep a rule: enforced, within a bound, or not at all.
 
     Parameters
     ----------
@@ -342,7 +342,7 @@ def verdict(rule: Rule, drive: Capabilities, limits: Any) -> str:
     drive : Capabilities
         Abilities of the drives.
     limits : DeviceDriverParameters
-        The driver's.
+        Parameters of the driver.
     """
     faults = (fault for fault in FAULTS if fault.rule is rule)
     if not can_keep(rule, drive):

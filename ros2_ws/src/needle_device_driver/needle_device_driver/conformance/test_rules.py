@@ -23,7 +23,7 @@ from needle_device_driver.rules import Rule
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run each test with all chosen drives, and random moments as often as chosen."""
+    """Parametrize the tests with the chosen drives and number of random moments."""
     chosen = metafunc.config.getoption("axis")
     known = [name for name in BACKENDS if name != HAND]
     axes = chosen.split(",") if chosen else known
@@ -36,7 +36,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.value)
 def test_rule(axis: str, rule: Rule, record_property: Callable[[str, object], None]) -> None:
-    """Check that the drives keep a rule as their abilities say."""
+    """Check that the drives keep a rule as far as their abilities allow."""
     make = partial(ConformanceRig, 1, axis=axis)
     rig = make()
     text = verdict(rule, rig.capabilities, rig.settings)

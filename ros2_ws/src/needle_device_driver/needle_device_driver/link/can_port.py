@@ -52,7 +52,7 @@ class LinkSettings:
         Raises
         ------
         UserError
-            A value out of bounds, an empty channel, or a bitrate that slcan does not support.
+            If a value is out of bounds, the channel is empty, or slcan lacks the bitrate.
         """
         check_fields(self)
         if not self.channel:
@@ -101,9 +101,9 @@ class CanPort(ReopeningPort[can.BusABC]):
     Parameters
     ----------
     settings : LinkSettings
-        The adapter.
+        Settings of the adapter.
     write_timeout : float
-        An adapter that accepts no frame for this time is lost [s].
+        An adapter that accepts no frame for this time counts as lost [s].
     clock : callable
         Returns the steady time [s].
     """
@@ -138,7 +138,7 @@ class CanPort(ReopeningPort[can.BusABC]):
         with contextlib.suppress(can.CanError, OSError):
             device.shutdown()
         if isinstance(device, SlcanBus):
-            # Where that command fails, python-can leaves the serial port open.
+            # If that command fails, python-can leaves the serial port open.
             device.serialPortOrig.close()
 
     def _read(self, device: can.BusABC) -> Batch:

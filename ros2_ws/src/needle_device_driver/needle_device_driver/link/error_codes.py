@@ -68,7 +68,7 @@ _ERRORS = {
     0x8611: "following error",
     0x8612: "reference limit",
 }
-# For other codes: their upper four bits.
+# Classes of other codes, by their upper four bits.
 _ERROR_CLASSES = {
     0x1: "generic error",
     0x2: "current",

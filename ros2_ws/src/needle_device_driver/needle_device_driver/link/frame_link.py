@@ -104,7 +104,7 @@ class FrameLink(Link):
         self.send(HEARTBEAT + MASTER_NODE_ID, bytes([NMT_OPERATIONAL]))
 
     def sdo_client(self, node_id: int) -> SdoClient:
-        """Return the SDO client of a node; each opening of the link has its own.
+        """Return the SDO client of a node; it is replaced when the link is reopened.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class FrameLink(Link):
         return self._sdo_clients[node_id]
 
     def _restart(self) -> None:
-        # Requests from before get no response.
+        # Earlier requests get no response.
         self._sdo_clients = {}
         self.other_master = ""
 

@@ -13,7 +13,7 @@ from needle_device_driver.procedure import Procedure
 
 
 class ObjectError(DriveError):
-    """An entry of a drive is not as the driver needs it.
+    """An entry of a drive does not meet the driver's requirements.
 
     Parameters
     ----------
@@ -96,8 +96,8 @@ class ObjectAccess:
         """Write an entry; raises as `read`.
 
         If the entry's size in the drive differs from the standard, the drive's size is used. A
-        refusal is no error if the entry has the value already, unless the entry is `variable`,
-        that is, later gets other values.
+        refusal is not an error if the entry already has the value, unless the entry is `variable`,
+        that is, gets other values later.
         """
         try:
             yield from self._download(entry, entry.pack(value))
@@ -124,7 +124,7 @@ class ObjectAccess:
         entry : Entry
             The entry.
         value : int
-            Its new value.
+            New value of the entry.
         accepted : tuple of int, optional
             Least and greatest accepted value after rounding by the drive; by default `value`.
         variable : bool

@@ -20,7 +20,7 @@ class Entry:
     format : str
         `struct` format, little-endian.
     name : str
-        As in CiA 301 or CiA 402.
+        Name in CiA 301 or CiA 402.
     rule : Rule or None
         The safety rule that needs it.
     """
@@ -137,7 +137,7 @@ NEGATIVE_LIMIT_SWITCH = 1 << 0
 POSITIVE_LIMIT_SWITCH = 1 << 1
 HOME_SWITCH = 1 << 2
 
-# Values that switch the software limits off; some drives accept only a part of the range.
+# Values that switch the software limits off; some drives accept only part of the range.
 NO_LIMITS = ((-(2**31), 2**31 - 1), (-(2**31) + 1, 2**31 - 1), (-(2**30), 2**30 - 1))
 
 # Function codes of the predefined connection set; a COB-ID is function code plus node id.

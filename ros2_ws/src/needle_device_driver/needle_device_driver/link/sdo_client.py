@@ -15,7 +15,7 @@ from needle_device_driver.link.error_codes import TIMED_OUT, describe_abort
 from needle_device_driver.link.objects import SDO_REQUEST
 from needle_device_driver.procedure import Procedure, Wait
 
-# A drive that writes to its flash memory or maps its PDOs takes some tenths of a second [s].
+# A drive that writes to its flash memory or maps its PDOs takes a few tenths of a second [s].
 _RESPONSE_TIMEOUT = 0.5
 _ATTEMPTS = 2
 
@@ -34,7 +34,7 @@ class SdoAbortedError(Exception):
     Parameters
     ----------
     code : int
-        Its abort code.
+        SDO abort code.
     """
 
     def __init__(self, code: int) -> None:
@@ -58,7 +58,7 @@ class SdoClient:
     beat : callable
         Sends the computer's heartbeat.
     period : float
-        Of the heartbeat [s].
+        Period of the heartbeat [s].
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class SdoClient:
 
     def receive(self, data: bytes) -> None:
         """Receive a frame of the node's SDO server."""
-        # Some drives leave out the unused bytes.
+        # Some drives omit the unused bytes.
         self._responses.append(data.ljust(8, b"\0"))
 
     def upload(self, index: int, subindex: int) -> Procedure[bytes]:

@@ -32,9 +32,9 @@ class SlcanBus(slcanBus):
     channel : str
         Device file of the serial port.
     bitrate : int
-        Of the CAN bus [bit/s].
+        Bitrate of the CAN bus [bit/s].
     tty_baudrate : int
-        Of the serial port [bit/s]; USB adapters ignore it.
+        Baud rate of the serial port [bit/s]; USB adapters ignore it.
     write_timeout : float
         Longest wait of a write for free space [s].
 

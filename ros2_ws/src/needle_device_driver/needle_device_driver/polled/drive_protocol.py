@@ -1,4 +1,4 @@
-"""Interface of a drive that answers requests: a backend implements it and knows no safety rule."""
+"""Interface of a drive that answers requests; backends implement it without safety rules."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _BEAT_PERIOD = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class DriveReply:
-    """State of a drive, as it answers a request; counts are the drive's own.
+    """State of a drive in its answer to a request; counts are the drive's own.
 
     Attributes
     ----------
     position : int
-        Measured, or the number of its own steps [counts].
+        Measured position, or the number of its own steps [counts].
     moving : bool
         Whether it executes an order.
     powered : bool
@@ -32,8 +32,8 @@ class DriveReply:
     home_switch, inner_switch : bool
         Whether the outer and the inner limit switch are active.
     fault : str
-        Why it refuses to move, as a fragment after "the drive", also for a refused order; empty: no
-        fault, or its watchdog has stopped it.
+        Why it refuses to move or refused an order, worded to follow "the drive"; empty: no fault,
+        or its watchdog has stopped it.
     timed_out : bool
         Whether its watchdog has stopped it.
     rebooted : bool
@@ -54,11 +54,11 @@ class DriveReply:
 
 
 class DriveProtocol(abc.ABC):
-    """The language of all drives behind one connection.
+    """The protocol of all drives behind one connection.
 
     Orders are queued on the link and return at once; procedures wait for answers and raise
-    `DriveError` and `LinkError`. The procedures of both axes run side by side, and their asks one
-    after the other, so that both may use the same key.
+    `DriveError` and `LinkError`. The procedures of both axes run side by side, but send one request
+    at a time, so that both may use the same key.
 
     Parameters
     ----------
@@ -78,8 +78,8 @@ class DriveProtocol(abc.ABC):
     parameters, axes, link
         The arguments.
     on_status : callable
-        To be called once with number and states by axis when all answers of a request are there,
-        however late.
+        Call it once per request with its number and the states by axis, when all answers have
+        arrived, however late.
     """
 
     capabilities: ClassVar[Capabilities]
@@ -95,17 +95,17 @@ class DriveProtocol(abc.ABC):
 
     @abc.abstractmethod
     def identify(self) -> Procedure[str]:
-        """Return name and version; it also resynchronises a connection that was opened again.
+        """Return name and version, and resynchronise a reopened connection.
 
-        Half a line may be in the drive: end it so that the drive refuses it. The name of an
+        The drive may hold a partial line: end it so that the drive rejects it. The name of an
         emulator begins with "Emulated".
         """
 
     @abc.abstractmethod
     def set_up(self, axis: str) -> Procedure[None]:
-        """Write all settings and a mark of this set-up; the drive is off afterwards.
+        """Write all settings and a marker of this set-up; the drive is off afterwards.
 
-        It moves nothing. A drive that has lost its mark has restarted: the state is read before a
+        It moves nothing. A drive that has lost its marker has restarted: the state is read before a
         new set-up. For a setting that the drive cannot have, raise `DriveError` with its bound.
         """
 
@@ -136,11 +136,11 @@ class DriveProtocol(abc.ABC):
         """Stop as fast as possible and discard the set-point."""
 
     def beat(self) -> None:  # noqa: B027 - a drive without a watchdog needs none
-        """Feed the watchdog, if there is one: in each cycle of 20 ms, and while an ask waits."""
+        """Feed the watchdog, if there is one: in each cycle of 20 ms, and while `ask` waits."""
 
     @abc.abstractmethod
     def request(self, number: int) -> None:
-        """Ask for the state of all drives; the answer has this number, 1..99.
+        """Request the state of all drives; the answer has this number, 1..99.
 
         The next request follows when this one is answered, or lost after three cycles.
         """

@@ -20,9 +20,9 @@ _REST = 3
 _STOP_MARGIN = 8
 # A drive that takes longer to switch on or off has failed [cycles].
 _MAX_SWITCHING = 100
-# An axis leaves its switch at this share of the homing speed: its edge is the home.
+# An axis leaves its switch at this share of the homing speed: the edge of the switch is home.
 _EDGE_SPEED = 0.1
-# A stopped axis that is farther from its set-point is blocked [cycles at full speed].
+# A stopped axis farther than this from its set-point is blocked [cycles at full speed].
 _BLOCKED = 1.5
 _CONFLICT = "the drive missed an order of this computer, or received one of another program"
 _OFF = DriveReply(0, moving=False, powered=False)
@@ -37,17 +37,17 @@ class _Homing(enum.Enum):
 class PolledAxis(CyclicAxis):
     """Axis on one drive of a `DriveProtocol`.
 
-    In each cycle, `transmit` sends the next order, and `update` handles the answer. Homing consists
-    of set-points, too.
+    In each cycle, `transmit` sends the next order, and `update` handles the answer. Homing also
+    consists of set-points.
 
     Parameters
     ----------
     name : str
         Insertion or rotation.
     settings : AxisSettings
-        The axis.
+        Settings of the axis.
     protocol : DriveProtocol
-        Language of the drive.
+        Protocol of the drive.
     refresh : callable
         Returns a procedure that requests the state of the drive and waits for it.
     """
@@ -89,7 +89,7 @@ class PolledAxis(CyclicAxis):
         self._was_off = self._released = False
 
     def home(self, speed: float) -> Procedure[None]:
-        """Begin to home: search the outer switch, and leave it slowly."""
+        """Begin homing: search for the outer switch, and leave it slowly."""
         self._refuse_fault()
         self._homed = self._limits_due = False
         self._homing, self._homing_speed, self._travelled = _Homing.SEARCH, speed, 0.0
@@ -99,7 +99,7 @@ class PolledAxis(CyclicAxis):
         """Set the set-point of the next cycle; it implies the speed."""
         counts = self._check_move(target, speed, self._target, ready=self._ready)
         if counts != self._target:
-            # A repeated set-point would replace the drive's unfinished order by a slower one.
+            # A repeated set-point would replace the drive's unfinished order with a slower one.
             step = abs(counts - self._target)
             self._move_to(counts, step / self._settings.counts_per_unit / PERIOD)
 
@@ -250,7 +250,7 @@ class PolledAxis(CyclicAxis):
         self._order_cycles = 0
 
     def _begin(self) -> None:
-        """Begin anew after a set-up or reset, with the drive off."""
+        """Start over after a set-up or reset, with the drive off."""
         self._problem = None
         self._stopping = self._released = self._was_off = False
         self._cycles = self._order_cycles = 0
@@ -299,7 +299,7 @@ class PolledAxis(CyclicAxis):
         if self._stopping and self._still >= _REST:
             self._stopping = False
             gap = abs(self._settings.position(self._last_target - at.position))
-            # The drive would move a blocked axis as soon as it comes free.
+            # The drive would move a blocked axis as soon as it is freed.
             self._released = self._goal_on and gap > _BLOCKED * self._settings.speed * PERIOD
         ends = self._stopping or not self._goal_on
         if ends and at.powered and at.moving and self._order_cycles > self._max_stop:

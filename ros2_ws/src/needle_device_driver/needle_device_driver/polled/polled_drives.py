@@ -16,8 +16,8 @@ from needle_device_driver.polled.text_link import StreamPort, TextLink
 from needle_device_driver.procedure import Procedure, Wait
 
 _NUMBERS = 99
-# A request that is not answered within this number of cycles is lost; until then no other follows,
-# so that a slow line does not pile them up, and one lost answer is not yet a silent drive.
+# A request that is not answered within this number of cycles is lost. Until then no other is sent:
+# requests must not pile up on a slow line, and one lost answer does not make a drive silent.
 _LOST_AFTER = 3
 _REFRESH_TIMEOUT = 0.5
 _EMULATED = "Emulated"
@@ -31,7 +31,7 @@ class PolledDrives(Drives):
     port : str
         Name of the component's port.
     protocol : DriveProtocol
-        Language of the drives.
+    Protocol of the drives.
     """
 
     def __init__(self, port: str, protocol: DriveProtocol) -> None:
@@ -45,7 +45,7 @@ class PolledDrives(Drives):
         protocol.on_status = self._on_status
         self._identity = ""
         self._number = 0
-        # When the last request was sent [s], and whether its answer is missing.
+        # Time of the last request [s], and whether its answer is missing.
         self._requested_at = 0.0
         self._is_waiting = False
 
@@ -130,7 +130,7 @@ def polled_backend(
     settings : type
         Dataclass of its parameters.
     protocol : type
-        Language of the drives.
+    Protocol of the drives.
     address, baudrate : callable
         Return device file or `host:port`, and the speed of a serial line, from the parameters.
     """

@@ -20,7 +20,7 @@ class _Serial:
         self._serial = serial.Serial(
             path, baudrate, timeout=_READ_TIMEOUT, write_timeout=timeout, exclusive=True
         )
-        # Adapters with an FTDI chip otherwise collect answers for 16 ms.
+        # Adapters with an FTDI chip otherwise buffer answers for 16 ms.
         with contextlib.suppress(OSError, ValueError):
             self._serial.set_low_latency_mode(True)
         self.write, self.close = self._serial.write, self._serial.close
@@ -37,9 +37,9 @@ class StreamPort(BytePort):
     address : str
         Device file, or `host:port`.
     baudrate : int
-        Of a serial device [bit/s].
+        Baud rate of a serial device [bit/s].
     write_timeout : float
-        A stream that accepts no bytes for this time is lost [s].
+        A stream that accepts no bytes for this time counts as lost [s].
     """
 
     def __init__(self, address: str, baudrate: int, write_timeout: float) -> None:
@@ -54,7 +54,7 @@ class StreamPort(BytePort):
         return _Serial(self._address, self._baudrate, self._timeout)
 
 
-# A longer line is none: the bytes are noise, or of another program [bytes].
+# Longer lines are noise or data of another program [bytes].
 _LONGEST_LINE = 1024
 
 
@@ -71,7 +71,7 @@ class TextLink(Link):
     Attributes
     ----------
     bytes_sent, lines_received, garbled : int
-        Counters; garbled are lines that are no ASCII text, or too long.
+        Counters; garbled lines are not ASCII text, or too long.
     """
 
     _counters = ("bytes_sent", "lines_received", "garbled")
@@ -79,7 +79,7 @@ class TextLink(Link):
     def __init__(self, name: str, terminators: bytes) -> None:
         super().__init__(name)
         self.bytes_sent = self.lines_received = self.garbled = 0
-        # Behind a terminator.
+        # Position after a terminator.
         self._line_end = re.compile(b"(?<=[" + re.escape(terminators) + b"])")
         self._rest = b""
         self._outgoing = b""

@@ -1,8 +1,8 @@
-"""Commands: the rules that each must satisfy, or it is refused as a whole; start, replacement.
+"""Checks of commands, which are refused as a whole if they break a rule; start, replacement.
 
-A step has one point: the target of both joints. A path has several points: rotation over insertion
-for the next part of a continuous insertion. A path may begin at an earlier position, with a point
-at `time_from_start` 0, and replaces the path under way.
+A step has one point: the target of both joints. A path has several: the rotation as a function of
+depth for the next part of a continuous insertion. A path may begin at an earlier position, with a
+point at `time_from_start` 0, and replaces the path under way.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class CommandContext:
     homed : bool
         Whether both axes are homed.
     not_new : str
-        Why the command's stamp is not new; empty: it is new.
+        Reason why the command's stamp is not new; else empty.
     tip_age : float
         Steady age of the command's stamp [s]; negative: it is in the future.
     publishers : int
@@ -85,7 +85,7 @@ def check_command(
     Returns
     -------
     tuple of Leg, or Refusal
-        Of a path only the part ahead of the last set-points, empty if they are at its end.
+        For a path, only the legs ahead of the last set-points; empty if these are at its end.
     """
     if context.publishers > 1:
         return Refusal(
@@ -217,8 +217,8 @@ def _check_bounds(
             f"insertion {back.leg.insertion * 1e3:.4g} mm is not ahead of the point before, "
             f"{back.start[0] * 1e3:.4g} mm",
         )
-    # A controller counts from the measured joints, which may differ from the last set-points by the
-    # tolerances. Speed and rate are also bounded during the motion, without them.
+    # A controller starts from the measured joints, which may differ from the last set-points by the
+    # tolerances. Speed and rate are also bounded during the motion, without tolerances.
     slack, turn_slack = limits.insertion_tolerance, limits.rotation_tolerance
     speed = max((piece.length - slack) / piece.leg.duration for piece in path)
     rotation = max(abs(piece.leg.rotation - context.rotation) for piece in path)
@@ -246,14 +246,14 @@ class CommandHandler:
     core : DeviceCore
         Executes accepted commands.
     hold : Hold
-        The hold to run.
+        Hold-to-run state.
     limits : SafetyLimits
         The bounds of the rules.
 
     Attributes
     ----------
     stamps : CommandStamps
-        Ages of stamps, and those that were used.
+        Ages of stamps, and stamps of accepted commands.
     refused : int
         Number of refused commands.
     newest_ns : int
@@ -294,7 +294,7 @@ class CommandHandler:
         if not self._on_path or stamp_ns is None:
             return
         age, limit = self.stamps.age(stamp_ns, now), self._limits.tip_age_limit
-        # The age is negative if ROS time was set back; the tip would never get too old.
+        # The age is negative if ROS time was set back; the tip would then never expire.
         if not 0.0 <= age <= limit:
             self._core.watchdog_trips += 1
             old = f"{age:.3f} s old, limit {limit:g} s"

@@ -6,9 +6,9 @@ import bisect
 import math
 from collections import deque
 
-# Tolerated lead of a sender's clock over the noted ROS time, for example by latency [ns].
+# Tolerated lead of a sender's clock over the noted ROS time, for example due to latency [ns].
 _MAX_LEAD_NS = 100_000_000
-# More steps than an insertion has.
+# Exceeds the number of steps of an insertion.
 _MAX_REMEMBERED = 2000
 
 
@@ -16,12 +16,12 @@ class CommandStamps:
     """Measures the age of stamps on the steady clock, and remembers the accepted ones.
 
     ROS time may be simulated, stepped or paused: ages in it would make every tip look old, or an
-    old tip look fresh. So the class notes which ROS time it was at which steady time.
+    old tip look fresh. So the class notes pairs of ROS time and steady time.
 
     Parameters
     ----------
     horizon : float
-        How long notes are kept [s]; ages beyond are infinite.
+        Time for which notes are kept [s]; greater ages are infinite.
     """
 
     def __init__(self, horizon: float) -> None:
@@ -82,6 +82,6 @@ class CommandStamps:
         return ""
 
     def clear_rejections(self) -> None:
-        """Accept commands from now on after ROS time went back; used stamps stay used."""
+        """Accept new commands again after ROS time went back; used stamps stay used."""
         if self._last_ns is not None and self._ros_ns:
             self._last_ns = min(self._last_ns, self._ros_ns[-1])

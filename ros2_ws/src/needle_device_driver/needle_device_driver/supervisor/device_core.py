@@ -44,9 +44,9 @@ class DeviceCore:
     configured : bool
         Whether the axes are set up.
     reason : str
-        Why the device last stopped, refused something or waits.
+        Reason why the device stopped, refused a request or waits.
     watchdog_trips : int
-        How often a hold, tip or feedback was too old.
+        Number of hold, tip and feedback time-outs.
     snapshot : PairSnapshot or None
         Newest feedback of the axes.
     step_stamp_ns : int or None
@@ -99,7 +99,7 @@ class DeviceCore:
 
     @property
     def fault(self) -> str:
-        """Reason of FAULT or ESTOPPED, with the axes that did not stop; otherwise empty."""
+        """Reason for FAULT or ESTOPPED, with the axes that did not stop; otherwise empty."""
         return f"{self._fault}; {self._stop_failures}" if self._stop_failures else self._fault
 
     @property
@@ -132,7 +132,7 @@ class DeviceCore:
     # ---- orders to both axes ------------------------------------------------------------------
 
     def order(self, order: Callable[[Axis], None]) -> str:
-        """Give both axes an order; an error is a fault, and its text is returned."""
+        """Send an order to both axes; an error is a fault, and its text is returned."""
         try:
             self._axes.each(order)
         except AxisError as error:
@@ -217,11 +217,11 @@ class DeviceCore:
         )
         self.change_state(Trigger.MOTION_START, "")
         if not self.snapshot.ready:
-            # A stopped axis becomes ready only by a new order.
+            # A stopped axis becomes ready only after a new order.
             self.order(lambda axis: axis.power(True))
 
     def replace(self, legs: Sequence[Leg], stamp_ns: int) -> None:
-        """Replace the path under way from the last set-point on, and report that.
+        """Replace the path under way from the last set-point on, and report its outcome.
 
         Parameters
         ----------
@@ -238,7 +238,7 @@ class DeviceCore:
         self.step_stamp_ns = stamp_ns
 
     def start_homing(self) -> Procedure[str]:
-        """Begin to home both axes; return the error."""
+        """Begin homing both axes; return the error."""
         if error := self.power_on():
             return error
         insertion = self._axes.insertion.home(self._limits.homing_speed)
@@ -278,7 +278,7 @@ class DeviceCore:
             self.power_off()
 
     def fail(self, reason: str, rule: Rule | None = None) -> None:
-        """Stop both axes for a fault, which lasts until a reset."""
+        """Stop both axes because of a fault, which lasts until a reset."""
         self.stops += 1
         if self.state not in (State.FAULT, State.ESTOPPED):
             self._stop_and_latch(Trigger.FAIL, reason, rule)
@@ -296,7 +296,7 @@ class DeviceCore:
         self.change_state(trigger, reason)
         self._events.append(Notice(reason, rule, fault=True))
         try:
-            # A drive with power would move a blocked axis as soon as it comes free.
+            # A powered drive would move a blocked axis as soon as it is freed.
             self._axes.each(lambda axis: axis.power(False))
         except AxisError as error:
             self.notice(str(error), error.rule)
@@ -310,7 +310,7 @@ class DeviceCore:
         return self.snapshot
 
     def drive_homing(self, period: float) -> None:
-        """Count `period` [s] of a homing."""
+        """Add `period` [s] to the time of a homing."""
         assert self.snapshot is not None
         if text := self._homing_times.advance(self.snapshot, period):
             self.fail(text, Rule.HOMING_TIME)
@@ -321,8 +321,8 @@ class DeviceCore:
             return
         at = self.poll(now)
         if not at.answered:
-            # A missing answer may mean a lost set-point: send no further one. An axis that stays
-            # silent becomes a fault.
+            # A missing answer may mean a lost set-point: do not send another. An axis that stays
+            # silent causes a fault.
             return
         problem = self._run.problem(at)
         if problem is not None:

@@ -12,7 +12,7 @@ from needle_device_driver.rules import Rule
 
 MAX_SOURCES = 16
 # Number of ended sessions that are remembered per source. Sessions cannot be ordered by name,
-# because the clock behind the name may be set back. Messages arrive seconds late at most, and no
+# because the clock behind the name may be set back. Messages arrive at most seconds late, and no
 # source restarts 16 times in that time.
 _MAX_ENDED = 16
 # Below every count.
@@ -26,14 +26,14 @@ class _Source:
     released: bool
     arrival: float
     count: int = _NO_COUNT
-    # End of its press; minus infinity: it does not press.
+    # End of its press; minus infinity if it does not press.
     until: float = -math.inf
     ended: collections.deque[str] = dataclasses.field(
         default_factory=lambda: collections.deque(maxlen=_MAX_ENDED)
     )
 
     def begin(self, session: str) -> None:
-        """Begin a new session; the present one has ended for good."""
+        """Begin a new session; the present one has ended and cannot resume."""
         self.ended.append(self.session)
         self.session, self.count = session, _NO_COUNT
         self.released, self.until = False, -math.inf
@@ -99,12 +99,12 @@ class Hold:
         now : float
             Steady time of its arrival [s].
         counting : bool
-            Whether the state of the device allows that a press counts.
+            Whether the state of the device allows a press to count.
 
         Returns
         -------
         Rule or None
-            Why the message does not count.
+            Rule that the message breaks; None if it counts.
         """
         source = self._source_of(message, now)
         if source is None:
@@ -138,7 +138,7 @@ class Hold:
         return None
 
     def end_if_stale(self, now: float) -> str:
-        """End the hold if the owner's last message has expired; return how, empty: it has not.
+        """End the hold if the owner's last message has expired; return the reason, if so.
 
         The next hold needs a release and a new press.
         """
@@ -154,7 +154,7 @@ class Hold:
         self._owner = None
 
     def knows(self, source: str) -> bool:
-        """Return whether the state of a source is remembered."""
+        """Return whether the state of a source is stored."""
         return source in self._sources
 
     def clear_rejections(self) -> None:
@@ -170,8 +170,8 @@ class Hold:
     def _source_of(self, message: HoldState, now: float) -> _Source | None:
         """Return the state of a message's source; None if there are too many sources.
 
-        The first press of a new source does not count before a release, except without a session,
-        that is, for messages that a person types.
+        The first press of a new source does not count before a release. Messages without a session,
+        which a person types, are exempt.
         """
         source = self._sources.get(message.source)
         if source is not None:
@@ -187,7 +187,7 @@ class Hold:
 
 
 class HoldNotices:
-    """Texts on holds that do not count, once until the reason changes."""
+    """Notices about holds that do not count, once until the reason changes."""
 
     def __init__(self) -> None:
         # Unknown sources share one entry. Ignored messages have entries of their own, because they
@@ -199,7 +199,7 @@ class HoldNotices:
         self._rules.clear()
 
     def text_for(self, message: HoldState, rule: Rule | None, *, known: bool) -> str:
-        """Return the text on a message that does not count by `rule`; empty: nothing new."""
+        """Return the notice about a message that breaks `rule`; empty: already given."""
         ignored = rule is Rule.HOLD_IN_ORDER
         key = message.source if known else None, ignored
         if rule is self._rules.get(key):

@@ -31,31 +31,31 @@ class SafetyLimits:
     max_step_length : float
         Longest insertion of one command [m].
     max_speed : float
-        Fastest insertion of a command [m/s], at most 5 mm/s.
+        Highest insertion speed of a command [m/s], at most 5 mm/s.
     max_rotation_step : float
         Largest rotation of one command [rad].
     max_rotation_rate : float
-        Fastest rotation of a command [rad/s].
+        Highest rotation rate of a command [rad/s].
     max_turns : float
-        Largest rotation either way from home, in turns [-].
+        Largest rotation from home in either direction, in turns [-].
     hold_timeout : float
         Lifetime of a hold message after its arrival [s].
     tip_age_limit : float
         Greatest age of the tip behind a command [s].
     reply_age_limit : float
-        An axis that is silent for longer has failed [s].
+        Time of silence after which an axis has failed [s].
     retraction_speed : float
-        Of the insertion axis [m/s].
+        Speed of a retraction [m/s].
     homing_speed : float
-        Of the insertion axis towards its switch [m/s].
+        Speed of the insertion axis towards its switch [m/s].
     homing_rotation_rate : float
-        Of the rotation axis towards its switch [rad/s].
+        Speed of the rotation axis towards its switch [rad/s].
     insertion_following_error, rotation_following_error : float
         Largest distance of an axis from its set-point [m], [rad].
     insertion_tolerance, rotation_tolerance : float
-        A motion has ended when each axis is closer to its target [m], [rad].
+        Largest distance from the target at the end of a motion [m], [rad].
     settling_time : float
-        Longest time for that after the last set-point [s].
+        Longest time to reach the target after the last set-point [s].
     """
 
     max_depth: float = fixed_parameter(0.2, "m", "Maximum insertion depth.", 0.001, 0.5)
@@ -110,7 +110,7 @@ class SafetyLimits:
         Raises
         ------
         UserError
-            A limit that is not finite, not positive, or above the bound of its parameter.
+            If a limit is not finite, not positive, or above the bound of its parameter.
         """
         for name, spec, _ in specs(SafetyLimits):
             check_bounds(name, getattr(self, name), ABOVE_0, spec.upper, spec.unit)
@@ -130,7 +130,7 @@ class SafetyLimits:
 
     @property
     def max_rotation(self) -> float:
-        """Largest rotation either way from home [rad]."""
+        """Largest rotation from home in either direction [rad]."""
         return self.max_turns * 2.0 * math.pi
 
     @property

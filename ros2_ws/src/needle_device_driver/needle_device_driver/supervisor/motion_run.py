@@ -1,4 +1,4 @@
-"""Motion under way, and what bounds it: set-points, homing time, retraction distance."""
+"""Motion under way and its bounds: set-points, homing time, retraction distance."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class MotionRun:
     feedback_delay : int
         Number of cycles until a set-point shows in the feedback.
     pushed : bool
-        Whether a hand moves the insertion axis; rotation then follows the measured insertion.
+        Whether the needle is inserted by hand; rotation then follows the measured insertion.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class MotionRun:
         self._settling = 0.0
 
     def rotation_lag(self, at: PairSnapshot) -> float:
-        """Return the lag of the rotation behind a needle that a hand pushes [rad]."""
+        """Return the lag of the rotation behind a needle that is pushed by hand [rad]."""
         if not (self._pushed and self._due):
             return 0.0
         return abs(self._motion.rotation_at(at.insertion.position) - self._due[-1].rotation)
@@ -175,7 +175,7 @@ class HomingTimes:
     Parameters
     ----------
     limits : SafetyLimits
-        With the longest homings.
+        Limits with the longest homings.
     """
 
     def __init__(self, limits: SafetyLimits) -> None:
@@ -183,7 +183,7 @@ class HomingTimes:
         self._times = [0.0, 0.0]
 
     def advance(self, at: PairSnapshot, period: float) -> str:
-        """Count `period` [s]; return which axis has taken too long, empty: none."""
+        """Add `period` [s]; return which axis has taken too long, or an empty text."""
         for k, (name, axis) in enumerate(at.by_name.items()):
             self._times[k] += period * axis.moving * (_OFF_SWITCH if axis.at_home_switch else 1)
             if self._times[k] > self._longest[k]:
@@ -197,7 +197,7 @@ class RetractionBound:
     Parameters
     ----------
     max_depth : float
-        Bound if the depth was never known [m].
+        Bound if the depth has never been known [m].
     """
 
     def __init__(self, max_depth: float) -> None:
@@ -205,7 +205,7 @@ class RetractionBound:
         self._before: AxisSnapshot | None = None
 
     def note(self, insertion: AxisSnapshot) -> None:
-        """Note a snapshot of the insertion axis; call it with each one."""
+        """Record a snapshot of the insertion axis; call it with every snapshot."""
         before, self._before = self._before, insertion
         if insertion.homed or before is None:
             return

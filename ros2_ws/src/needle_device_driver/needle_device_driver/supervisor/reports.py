@@ -41,7 +41,7 @@ Event: TypeAlias = CommandResult | Notice
 
 
 class NoticeLimit:
-    """Admits `MAX_NOTICES` of each rule in `NOTICE_PERIOD` and counts the others; faults always."""
+    """Admits all faults, and `MAX_NOTICES` per rule in `NOTICE_PERIOD`; counts the others."""
 
     def __init__(self) -> None:
         self._since: dict[Rule | None, float] = {}

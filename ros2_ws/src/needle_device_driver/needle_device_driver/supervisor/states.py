@@ -69,5 +69,5 @@ TRANSITIONS: dict[tuple[State, Trigger], State] = {
 
 
 def next_state(state: State, trigger: Trigger) -> State:
-    """Return the state after `trigger`; a KeyError, if the table has no such transition."""
+    """Return the state after `trigger`; raises KeyError if the table has no such transition."""
     return TRANSITIONS[state, trigger]

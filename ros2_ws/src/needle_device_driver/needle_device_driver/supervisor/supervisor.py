@@ -141,7 +141,7 @@ class MotionSupervisor:
         return ServiceResult(True, "configured")
 
     def deconfigure(self) -> Procedure[ServiceResult]:
-        """Stop, switch the axes off and release them; a fault or emergency stop stays."""
+        """Stop, switch the axes off and release them; a fault or emergency stop remains."""
         if self._core.state in (State.HOLDING, State.MOVING):
             self._disable()
         if not (yield from self._core.deconfigure()):
@@ -181,7 +181,7 @@ class MotionSupervisor:
             self._core.fail(conflict, Rule.ONE_DEVICE)
 
     def fail(self, reason: str, rule: Rule | None = None) -> None:
-        """Stop both axes for a fault, which lasts until a reset."""
+        """Stop both axes because of a fault, which lasts until a reset."""
         self._core.fail(reason, rule)
 
     def submit(self, command: Trajectory, now: float, publishers: int = 1) -> None:
@@ -192,7 +192,7 @@ class MotionSupervisor:
         Parameters
         ----------
         command : Trajectory
-            As received, unchecked.
+            The command as received, unchecked.
         now : float
             Steady time [s].
         publishers : int
@@ -223,7 +223,7 @@ class MotionSupervisor:
         return ServiceResult(True, "enabled; nothing moves without hold")
 
     def confirm_needle_out(self, confirmed: bool) -> ServiceResult:
-        """Note a person's confirmation that the needle is out; the next step ends it."""
+        """Record a person's confirmation that the needle is out; the next step cancels it."""
         if self._core.activity is not Activity.NONE:
             return ServiceResult(False, f"a {self._core.activity.value} is under way")
         if confirmed and self._conflict:
@@ -232,7 +232,7 @@ class MotionSupervisor:
         return ServiceResult(True, "needle out" if confirmed else "needle not out")
 
     def home(self, now: float) -> Procedure[ServiceResult]:
-        """Begin to home both axes; requires that the needle is out."""
+        """Begin homing both axes; requires that the needle is out."""
         if self._core.state is not State.DISABLED:
             return self._wrong_state(State.DISABLED)
         if not self._needle_out:
@@ -246,7 +246,7 @@ class MotionSupervisor:
         return ServiceResult(True, "homing" if homing else "homed")
 
     def retract(self, now: float) -> ServiceResult:  # noqa: PLR0911 - each return is a reason
-        """Begin to retract the needle: slowly, without rotation, while the hold lasts."""
+        """Begin retracting the needle: slowly, without rotation, while the hold lasts."""
         self._check_hold_age(now)
         if self._core.state is not State.HOLDING:
             return self._wrong_state(State.HOLDING)
@@ -279,7 +279,7 @@ class MotionSupervisor:
         return ServiceResult(True, f"{activity} stopped")
 
     def reset(self, now: float) -> Procedure[ServiceResult]:  # noqa: PLR0911 - each is a reason
-        """Leave FAULT or ESTOPPED, and forget rejected stamps; moves and enables nothing."""
+        """Leave FAULT or ESTOPPED, and clear rejected stamps; moves and enables nothing."""
         if self._core.state is State.MOVING:
             return ServiceResult(False, f"a {self._core.activity.value} is under way")
         self._hold.clear_rejections()

@@ -39,18 +39,18 @@ class NetworkState(enum.IntEnum):
 class CanopenDevice(abc.ABC):
     """Generic CANopen device; a subclass adds the profile.
 
-    Sent frames collect in `outbox`. All times are readings of one steady clock [s].
+    Sent frames are collected in `outbox`. All times are readings of one steady clock [s].
 
     Parameters
     ----------
     node_id : int
-        1..127.
+        Node id, 1..127.
     dictionary : ObjectDictionary
         Objects from 0x2000 up; the device adds the communication objects.
     default_receive, default_transmit : tuple of int
         Mapping of the first PDO of each direction after power-up.
     boot_time : float
-        From power-up to the boot-up message [s].
+        Time from power-up to the boot-up message [s].
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class CanopenDevice(abc.ABC):
 
     def receive(self, frame: CanFrame, now: float) -> None:
         """Handle a frame other than SYNC."""
-        # Remote frames are not supported, like by many drives.
+        # Like many drives, this one does not support remote frames.
         if self.network_state is NetworkState.BOOTING or frame.remote:
             return
         identifier = frame.identifier
@@ -149,7 +149,7 @@ class CanopenDevice(abc.ABC):
                 self._send_pdo(pdo, pdo.event())
 
     def emergency(self, code: int, register: int = 0) -> None:
-        """Send an emergency; code 0 means that no error is left."""
+        """Send an emergency; code 0 means that no error remains."""
         if code:
             register |= _GENERIC_ERROR
         self._objects.set(0x1001, 0, register)

@@ -31,7 +31,7 @@ class SdoAbortError(Exception):
 
 
 def one_of(values: tuple[int, ...]) -> Callable[[int], None]:
-    """Return a check that rejects all other values."""
+    """Return a check that rejects any value not in `values`."""
 
     def check(value: int) -> None:
         if value not in values:
@@ -68,7 +68,7 @@ class Kind(enum.Enum):
 
 @dataclasses.dataclass
 class StoredObject:
-    """Value of the dictionary.
+    """Value in the dictionary.
 
     Attributes
     ----------

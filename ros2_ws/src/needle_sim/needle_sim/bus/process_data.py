@@ -171,7 +171,7 @@ class TransmitPdo(_Pdo):
         return data
 
     def reset(self) -> None:
-        """Forget the data sent last, so that the next event sends it again."""
+        """Discard the last sent data, so that the next event sends them again."""
         self._sent = None
 
     def _data(self) -> bytes:

@@ -18,13 +18,13 @@ from needle_core.process.ros_domain import Claim
 from needle_sim.bus.slcan_adapter import SlcanAdapter
 
 _READ_SIZE = 4096
-# Output that the computer does not read is lost, as in an adapter with a full buffer [bytes].
+# Unread output beyond this size is lost, as in an adapter with a full buffer [bytes].
 _MAX_PENDING = 16384
 _WAKE_UP_PERIOD = 0.05  # [s]
 
 
 class PtyCan:
-    """Port of a component: a pseudo-terminal, which a computer opens as a serial CAN adapter.
+    """Port of a component: a pseudo-terminal that a computer opens as a serial CAN adapter.
 
     `open` starts a thread that reads it; without one, call `receive`.
 
@@ -61,14 +61,14 @@ class PtyCan:
         self._thread.start()
 
     def read(self, arrive: Callable[[Any], None]) -> None:
-        """Deliver frames of the computer until the port is closed."""
+        """Deliver frames from the computer until the port is closed."""
         while not self._is_closed:
             self.wait(_WAKE_UP_PERIOD)
             if frames := self.receive():
                 arrive(frames)
 
     def wait(self, timeout: float) -> None:
-        """Wait for input, for at most a time [s]."""
+        """Wait for input, at most for `timeout` [s]."""
         inputs = [self._master] if self._master >= 0 else []
         # The adapter may be unplugged meanwhile.
         with contextlib.suppress(OSError):
@@ -84,7 +84,7 @@ class PtyCan:
             result = self._adapter.feed(data)
             if result.closed:
                 # The next program closes the channel before it opens it, and must not read output
-                # for the previous one. At opening it would be too late.
+                # for the previous one. Flushing at the opening would be too late.
                 self._pending = b""
                 termios.tcflush(self._slave, termios.TCIFLUSH)
             self._write(result.reply)
@@ -100,7 +100,7 @@ class PtyCan:
     def plug(self, *, plugged_in: bool) -> None:
         """Plug the adapter in, with the channel closed, or unplug it.
 
-        A program that has it open gets an error then.
+        A program that has it open then gets an error.
         """
         with self._lock:
             if plugged_in and self._master < 0:

@@ -23,7 +23,7 @@ _MAX_DATA = 8
 
 @dataclasses.dataclass(frozen=True)
 class SlcanInput:
-    """Result of some bytes from the computer.
+    """Result of processing bytes from the computer.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""TCP server of a byte stream: the port of emulated drives that speak lines of text."""
+"""TCP server for a byte stream: the port of emulated drives with a text protocol."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _WAKE_UP_PERIOD = 0.05  # [s]
 class ClientBytes(bytes):
     """Bytes from or for one client.
 
-    Plain bytes are of client 0, the only one of a connection between components.
+    Plain bytes belong to client 0, the only one of a connection between components.
 
     Parameters
     ----------
@@ -67,11 +67,11 @@ class StreamServer:
 
     @property
     def path(self) -> str:
-        """Host and port, as a client gives them."""
+        """Host and port, in the form that a client uses."""
         return "{}:{}".format(*self._address)
 
     def open(self, arrive: Callable[[Any], None]) -> None:
-        """Begin to deliver the clients' bytes."""
+        """Start delivering the clients' bytes."""
         self._arrive = arrive
 
     def send(self, batch: Sequence[bytes]) -> None:

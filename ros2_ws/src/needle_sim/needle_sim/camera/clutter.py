@@ -302,7 +302,7 @@ def hand_capsules(
 
 PAPER_LINE_WIDTH, PAPER_GREY = 0.0004, 95.0
 """Width [m] and brightness [grey levels] of the paper's lines."""
-# Depth of the paper under the surface, and distance of its lines [m].
+# Depth of the paper under the surface, and spacing of its lines [m].
 _PAPER_DEPTH, _PAPER_PITCH = 0.035, 0.005
 _PAPER_LENGTHS, _PAPER_SIDES = (-0.02, 0.16), (-0.07, 0.07)
 _POINTS = 60
@@ -317,7 +317,7 @@ def paper_lines(half_height: float, rng: np.random.Generator) -> list[FloatArray
     half_height : float
         Distance from the needle's entry to the phantom's surface [m].
     rng : numpy.random.Generator
-        Generator of its random pose.
+        Generator for its random pose.
     """
     turn, aside, ahead = rng.uniform(-_LARGEST_TURN, _LARGEST_TURN), *rng.uniform(0.0, 1.0, 2)
     along = np.array([0.0, np.sin(turn), np.cos(turn)])

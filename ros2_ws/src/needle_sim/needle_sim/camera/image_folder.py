@@ -37,7 +37,7 @@ class Truth:
     pitch, yaw : float
         Direction of the heading [rad].
     shaft_pitch, shaft_yaw : float
-        Direction of the visible distal segment, which the pre-bend tilts off the heading [rad].
+        Direction of the visible distal segment, tilted from the heading by the pre-bend [rad].
     """
 
     tip: FloatArray
@@ -113,11 +113,11 @@ class ImageFolder:
         number : int
             Number of the exposure, which names the files.
         images : pair of ndarray of uint8
-            Left and right.
+            Left and right image.
         insertion : float
             Insertion of the stage [m].
         truth : Truth or None
-            Ground truth; None without a needle, for empty fields.
+            Ground truth; None without a needle: empty fields.
         visible_share : pair of float
             Visible share of the needle's last 10 mm, in the left and the right image.
         more : sequence of float or str

@@ -28,7 +28,7 @@ _WAVE_LENGTHS = (0.025, 0.090)
 _WAVE_ANGLES = (0.3, 1.2)
 _TURNS_PER_M = 17.0
 _LARGEST_PITCH = np.deg2rad(5.0)
-# Clearance of the tip from the phantom's faces, and bound from the sides of the view [m].
+# Clearance of the tip from the phantom's faces, and its largest offset to the side [m].
 _CLEARANCE = 0.004
 _SIDE = 0.025
 

@@ -33,7 +33,7 @@ def lamp_light(camera: SimulatedCamera) -> FloatImage:
 def uneven_light(
     lighting: Lighting, camera: SimulatedCamera, rng: np.random.Generator
 ) -> FloatImage:
-    """Return the factor of the lamp's light: wide blotches, and one side in a soft shade."""
+    """Return the factor of the lamp's light: wide blotches, and a soft shade on one side."""
     size = (camera.image_width, camera.image_height)
     small = (-(-size[0] // _COARSE), -(-size[1] // _COARSE))
     field = cv2.GaussianBlur(
@@ -54,7 +54,7 @@ def uneven_light(
 
 
 def drift(lighting: Lighting, exposure_number: int, phase: float) -> float:
-    """Return the factor of all light in an exposure; `phase` is the initial phase [rad]."""
+    """Return the factor by which an exposure's light drifts; `phase` is the initial one [rad]."""
     angle = 2.0 * np.pi * exposure_number / lighting.drift_period + phase
     return float(1.0 + lighting.drift * np.sin(angle))
 
@@ -113,7 +113,7 @@ _LAMP_SIDE, _LAMP_HEIGHT, _LAMP_ALONG = (0.1, 0.3), 0.4, (0.02, 0.1)
 
 
 def place_lamp(rng: np.random.Generator) -> FloatArray:
-    """Return the position of a run's lamp, to either side above the phantom, shape (3,) [m]."""
+    """Return the position of a run's lamp, on either side above the phantom, shape (3,) [m]."""
     side = float(rng.choice([-1.0, 1.0])) * rng.uniform(*_LAMP_SIDE)
     return np.array([_LAMP_HEIGHT, side, rng.uniform(*_LAMP_ALONG)])
 
@@ -121,12 +121,12 @@ def place_lamp(rng: np.random.Generator) -> FloatArray:
 def lamp_reflection(
     line: FloatArray, camera: FloatArray, lamp: FloatArray, metal: MetalShaft
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the reflection of the lamp on a bare metal shaft: its strength, and its place across.
+    """Return the reflection of the lamp on a bare metal shaft: its strength and lateral position.
 
-    A cylinder mirrors the lamp along the line where its normal halves the angle between lamp and
+    A cylinder mirrors the lamp along the line where its normal bisects the angle between lamp and
     camera. Where the shaft bends away from that, the bright core fades and the needle is dark up to
-    its end, in one view sooner than in the other. Refraction is neglected, which moves the place of
-    fading but not its look.
+    its end, in one view sooner than in the other. Refraction is neglected, which changes where the
+    core fades but not how it looks.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def lamp_reflection(
     share : ndarray, shape (M,)
         Share of the lamp's light, 0 to 1.
     place : ndarray, shape (M,)
-        Place of the core over the shaft's radius, positive towards `cross(ahead, to camera)`.
+        Position of the core over the shaft's radius, positive towards `cross(ahead, to camera)`.
     """
     ahead = np.gradient(line, axis=0)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)

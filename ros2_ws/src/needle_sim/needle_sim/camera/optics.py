@@ -9,15 +9,15 @@ from needle_sim.camera.scenarios import Lens
 from needle_sim.camera.stereo_rig import SimulatedCamera, SimulatedWindow
 from needle_sim.needle.se3 import FloatArray
 
-# The equation of the slope is concave and increasing: Newton converges in 3 steps.
+# The equation for the slope is concave and increasing: Newton's method converges in 3 steps.
 _NEWTON_STEPS = 4
 
 
 def refraction_point(points: ArrayLike, centre: ArrayLike, window: SimulatedWindow) -> FloatArray:
     """Return where the ray from a point to a camera crosses the window's outer face.
 
-    With a = tan(angle in air), Snell's law makes tan(angle in a medium) a / sqrt(n^2 + (n^2 - 1)
-    a^2); the stretches in air and all media must add up to the distance along the window.
+    With a = tan(angle in air), Snell's law gives tan(angle in a medium) = a / sqrt(n^2 + (n^2 - 1)
+    a^2); the offsets in air and all media must add up to the distance along the window.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class Optics:
     camera : SimulatedCamera
         Camera of the rig.
     lens : Lens or None
-        Lens; None is in focus everywhere.
+        Lens; None: in focus everywhere.
     """
 
     def __init__(self, camera: SimulatedCamera, lens: Lens | None) -> None:
@@ -161,10 +161,10 @@ class Optics:
         return np.asarray(np.linalg.norm(ends[0] - ends[1], axis=-1) / 2.0)
 
     def blur_px(self, points: FloatArray) -> float | FloatArray:
-        """Return the blur's standard deviation at points (..., 3), a single one if in focus [px].
+        """Return the blur's standard deviation at points (..., 3), a scalar without a lens [px].
 
-        A circle of confusion of diameter c blurs like a Gaussian of c / 4. Refraction scales the
-        apparent depth in a medium by 1 / n.
+        A circle of confusion of diameter c blurs like a Gaussian of standard deviation c / 4.
+        Refraction scales the apparent depth in a medium by 1 / n.
         """
         if self._lens is None:
             return SHARP_PX

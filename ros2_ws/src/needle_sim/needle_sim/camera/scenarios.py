@@ -111,7 +111,7 @@ class MetalShaft:
     core : float
         Brightness where it mirrors the lamp [grey levels].
     core_width : float
-        Width of the mirrored lamp over that of the needle.
+        Width of the mirrored lamp relative to that of the needle.
     spread : float
         Rotation of the shaft at which the lamp has faded to a third [rad].
     """
@@ -148,7 +148,7 @@ class Scenario:
     name : str
         Name in `SCENARIOS`.
     summary : str
-        One line for the user.
+        Description for the user.
     noise : float
         Standard deviation of the sensor noise [grey levels].
     needle : bool
@@ -162,7 +162,7 @@ class Scenario:
     Raises
     ------
     OutOfBoundsError
-        If `noise` is not within 0 and 50 grey levels.
+        If `noise` is not between 0 and 50 grey levels.
     """
 
     name: str
@@ -247,7 +247,7 @@ _ALL = (
     ),
 )
 SCENARIOS = {scenario.name: scenario for scenario in _ALL}
-"""Name to scenario."""
+"""Scenarios by name."""
 
 
 def find_scenario(name: str) -> Scenario:

@@ -46,7 +46,7 @@ class SimulatedWindow:
         return np.asarray(points, dtype=np.float64) @ self.normal
 
     def layer_lengths(self, height: FloatArray) -> list[FloatArray]:
-        """Return the thickness of each layer, and of the phantom, above points of a height [m]."""
+        """Return the thickness of each layer, and of the phantom, above points at a height [m]."""
         left = np.maximum(self.outer - height, 0.0)
         lengths = []
         for thickness in self.thicknesses:
@@ -145,7 +145,7 @@ def load_stereo_rig(path: Path | str) -> StereoRig:
     Raises
     ------
     UserError
-        If it cannot be read or a value is invalid; the message has file and key.
+        If it cannot be read or a value is invalid; the message names file and key.
     """
     path = Path(path)
     text = read_calibration(path)
@@ -194,7 +194,7 @@ def _number(document: Any, key: str, lower: float = -math.inf) -> float:
 
 
 def _unit_vector(document: Any, key: str, size: int) -> FloatArray:
-    """Return a vector of length 1, without its rounding error."""
+    """Return a vector, normalised to exactly length 1."""
     vector = _numbers(document, key, size)
     length = float(np.linalg.norm(vector))
     if abs(length - 1.0) > _LENGTH_TOLERANCE:
@@ -203,7 +203,7 @@ def _unit_vector(document: Any, key: str, size: int) -> FloatArray:
 
 
 def _window(document: Any, side: str) -> SimulatedWindow:
-    """Return the window of a camera: its own one, or the phantom's surface."""
+    """Return the window of a camera: its own, or the phantom's surface."""
     if "window" not in _entry(document, side):
         height = _number(document, "phantom.surface_height")
         index = _number(document, "phantom.refractive_index", 1.0)

@@ -23,7 +23,7 @@ class Stroke:
     sample : ndarray of int, shape (N,)
         Index of the centreline point that belongs to the pixel.
     across : ndarray, shape (N,)
-        Distance from the centreline over the half width; 1 is the edge.
+        Distance from the centreline relative to the half width; 1 is the edge.
     coverage : ndarray, shape (N,)
         Share of the pixel's light that comes from the stroke, 0..1.
     """

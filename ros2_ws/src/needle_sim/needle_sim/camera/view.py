@@ -43,8 +43,8 @@ _CABLE = 40.0
 _HAND = 118.0
 _HAND_EDGE = 62.0
 _COVER = 24.0
-# Sensor noise at 65536 equally likely levels: a 16-bit draw takes a third of the time of a normal
-# one.
+# Sensor noise at 65536 equally likely levels: drawing a 16-bit number is three times as fast as
+# drawing a normal one.
 _NORMAL_TABLE = ndtri((np.arange(65536) + 0.5) / 65536.0)
 _NOISE_BAND_ROWS = 32
 _MOTTLE = 1.5
@@ -183,7 +183,7 @@ class View:
         return np.asarray(cv2.convertScaleAbs(cv2.max(image, 0.0)), dtype=np.uint8)
 
     def visible_share(self, points: FloatArray, moment: SceneState) -> float:
-        """Return the share of points (M, 3) in `rig` that are in the image and not under a hand."""
+        """Return the share of points (M, 3) in `rig` that are in the image, not behind a hand."""
         pixels = self._optics.project(points)
         visible = self._optics.in_image(pixels)
         if moment.hand and len(points):

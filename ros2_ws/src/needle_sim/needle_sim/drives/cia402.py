@@ -38,7 +38,7 @@ _S, _O = PowerState, PowerCommand
 TRANSITIONS: dict[tuple[PowerState, PowerCommand], PowerState] = {
     (_S.SWITCH_ON_DISABLED, _O.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 2
     (_S.READY_TO_SWITCH_ON, _O.SWITCH_ON): _S.SWITCHED_ON,  # 3
-    # Transitions 3 and 4 at once, like most drives.
+    # Transitions 3 and 4 at once, as in most drives.
     (_S.READY_TO_SWITCH_ON, _O.ENABLE_OPERATION): _S.OPERATION_ENABLED,
     (_S.SWITCHED_ON, _O.ENABLE_OPERATION): _S.OPERATION_ENABLED,  # 4
     (_S.OPERATION_ENABLED, _O.SWITCH_ON): _S.SWITCHED_ON,  # 5

@@ -19,7 +19,7 @@ NEW_SET_POINT = HOMING_START = 1 << 4
 _AT_ONCE, _RELATIVE = 1 << 5, 1 << 6
 HALT = 1 << 8
 _REACHED, _LIMITED, _BIT_12, _BIT_13 = 1 << 10, 1 << 11, 1 << 12, 1 << 13
-# 0x60FD.
+# Bits of the digital inputs (0x60FD).
 _NEGATIVE_SWITCH, _POSITIVE_SWITCH, _HOME_SWITCH = 1, 2, 4
 _NO_WINDOW = 0xFFFFFFFF
 
@@ -71,7 +71,7 @@ class DriveMotion:
         self.clear_targets()
 
     def clear_targets(self) -> None:
-        """Drop all targets; a present motion still needs a ramp."""
+        """Discard all targets; a motion under way still needs a ramp."""
         self._target = self._next_target = self._homing = None
         self._late = 0.0
 
@@ -113,7 +113,7 @@ class DriveMotion:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the demand rests, independent of the motor."""
+        """Whether the demand is at rest, regardless of the motor."""
         return self._demand.at_rest
 
     @property

@@ -31,7 +31,7 @@ class EmulatedBus(EmulatedDrives):
             drive.power_up(now)
 
     def receive(self, batch: Sequence[CanFrame], now: float) -> list[CanFrame]:
-        """Handle frames of the master at steady time `now` [s]; return the immediate answers."""
+        """Handle frames from the master at steady time `now` [s]; return the immediate answers."""
         if not self.is_cut:
             self.advance_to(now)
             for frame in batch:
@@ -64,12 +64,12 @@ class EmulatedBus(EmulatedDrives):
         self.drives[axis].power_up(now)
 
     def intrude(self) -> bool:
-        """Let another master send a SYNC."""
+        """Simulate a SYNC from another master."""
         next(iter(self.drives.values())).outbox.append(CanFrame(SYNC))
         return True
 
     def restore(self, now: float) -> None:
-        """End cut bus, stalled motors and hung processors; drive faults stay until reset."""
+        """End cut bus, stalled motors and hung processors; drive faults remain until reset."""
         hung = [drive for drive in self.drives.values() if drive.hung]
         super().restore(now)
         for drive in hung:

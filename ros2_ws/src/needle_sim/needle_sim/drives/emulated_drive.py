@@ -54,13 +54,13 @@ class EmulatedDriveSettings:
     name : str
         Name of the axis.
     node_id : int
-        1..127.
+        Node id, 1..127.
     device_type : int
         Object 0x1000: stepper or servo.
     motor : MotorSettings
         Mechanics of the axis.
     boot_time : float
-        From power-up to the boot-up message [s].
+        Time from power-up to the boot-up message [s].
     rpm : float or None
         One rpm of the motor [counts/s], for a drive with speeds in rpm and ramps in rpm/s.
     """
@@ -239,7 +239,7 @@ class EmulatedDrive(CanopenDevice):
         return self._objects.value(index) != _AT_ONCE
 
     def on_boot(self) -> None:
-        """Get ready to be switched on."""
+        """Become ready to be switched on."""
         self.state = PowerState.SWITCH_ON_DISABLED
 
     def on_connection_lost(self) -> None:

@@ -12,7 +12,7 @@ from needle_sim.drives.motor import Motor
 MOTION_STEP = 0.001
 """Time step of the motion [s]."""
 FAULT = "FAULT"
-"""Begin of the state of a drive with a fault."""
+"""Prefix of the state of a drive with a fault."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ class EmulatedDrives(abc.ABC):
     Parameters
     ----------
     drives : mapping of str to AxisDrive
-        Axis (`insertion`, `rotation`) to its drive.
+        Drive of each axis (`insertion`, `rotation`).
     now : float
         Steady time of power-up [s].
 
@@ -85,7 +85,7 @@ class EmulatedDrives(abc.ABC):
 
     @abc.abstractmethod
     def poll(self, now: float) -> list[Any]:
-        """Advance the drives to steady time `now` [s]; return what they sent."""
+        """Advance the drives to steady time `now` [s]; return the data that they sent."""
 
     def states(self) -> dict[str, str]:
         """Return the state of each drive; it begins with `FAULT` for a fault."""
@@ -105,7 +105,7 @@ class EmulatedDrives(abc.ABC):
 
     def advance_to(self, now: float) -> None:
         """Advance the motion to steady time `now` [s]."""
-        # The tolerance compensates the rounding of times.
+        # The tolerance compensates for the rounding of times.
         steps = int((now - self._advanced_to) / MOTION_STEP + 1e-6)
         if steps > 0:
             self._advanced_to += steps * MOTION_STEP
@@ -126,15 +126,15 @@ class EmulatedDrives(abc.ABC):
         self._drives[axis].fail(code)
 
     def hang(self, axis: str) -> None:
-        """Hang the processor of a drive: it is silent, and its motor ends at the set-point."""
+        """Hang the processor of a drive: it is silent, and its motor stops at the set-point."""
         self._drives[axis].hung = True
 
     def intrude(self) -> bool:
-        """Let another computer interfere; return False if none can be connected."""
+        """Interfere as another computer; return False if none can be connected."""
         return False
 
     def restore(self, now: float) -> None:
-        """End cut connection, stalled motors and hung processors; faults stay until reset."""
+        """End cut connection, stalled motors and hung processors; faults remain until reset."""
         self.is_cut = False
         for drive in self._drives.values():
             drive.motor.stalled = drive.hung = False

@@ -17,13 +17,13 @@ _REGISTERS = {"AC": 256000, "DC": 256000, "SD": 256000, "SP": 25000, "PA": 0, "P
 _REGISTERS |= {"ER": 16384, "OE": 0, "FL": 2**31 - 1, "BL": -(2**31)}
 _CHANNELS = {"insertion": "A", "rotation": "B"}
 _RESOLUTION = {"AC": 1024, "DC": 1024, "SD": 1024, "SP": 2}
-# Commands to axes, and operands, as parts of `GalilAxis`.
+# Commands to axes, and operands, as attributes of `GalilAxis`.
 _AXIS_COMMANDS = {"SH": "servo_here", "MO": "motor_off", "BG": "begin", "ST": "stop"}
 _OPERANDS = {"TP": "position", "RP": "reference", "TS": "status", "SC": "cause", "BG": "moving"}
 
 
 class _RefusedError(Exception):
-    """A command is refused; the argument is what TC1 answers."""
+    """A command is refused; the argument is the reply to TC1."""
 
 
 class GalilAxis(TextDrive):
@@ -125,7 +125,7 @@ class GalilDrives(TextDrives[GalilAxis]):
     Parameters
     ----------
     motors : mapping of str to MotorSettings
-        Axis to its mechanics.
+        Mechanics of each axis.
     now : float
         Steady time of power-up [s].
     """
@@ -139,7 +139,7 @@ class GalilDrives(TextDrives[GalilAxis]):
         self._by_channel = {_CHANNELS[name]: drive for name, drive in self.drives.items()}
 
     def receive(self, batch: Sequence[bytes], now: float) -> list[bytes]:
-        """Handle bytes of the clients; a backslash ends a download without a line end."""
+        """Handle bytes from the clients; a backslash ends a download without a line end."""
         chunks = [(chunk.replace(b"\\", b"\\\r"), getattr(chunk, "client", 0)) for chunk in batch]
         return super().receive([ClientBytes(*chunk) for chunk in chunks], now)
 
@@ -168,7 +168,7 @@ class GalilDrives(TextDrives[GalilAxis]):
 
     def watch(self, now: float) -> None:
         """Execute the next commands of the program's thread."""
-        # It executes about five in a millisecond.
+        # It executes about five commands per millisecond.
         for _ in range(5):
             if not 0 <= self._next < len(self._program) or now < self._wake:
                 return
@@ -181,7 +181,7 @@ class GalilDrives(TextDrives[GalilAxis]):
                     values = [self._value(text, now) for text in "".join(condition).split(">")]
                     if len(values) < 2 or values[0] > values[1]:
                         self._next = self._program.index(label)
-                # EN, as a refused command, ends it.
+                # A refused command, such as EN, ends the program.
                 case _ if not command.startswith("#") and self._reply_to(command, now) == b"?":
                     self._next = -1
 

@@ -1,4 +1,4 @@
-"""Motion profiles of a drive: set-points, trapezoids, ramps and homing; counts and seconds."""
+"""Motion profiles of a drive in counts and seconds: set-points, trapezoids, ramps, homing."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Demand:
         if self._segment_left <= 0.0:
             self.velocity = 0.0
             return
-        # The tolerance prevents one more step for a rounding error.
+        # The tolerance prevents an extra step due to a rounding error.
         if period >= self._segment_left * (1.0 - 1e-9):
             self.position = self._segment_end
             self._segment_left = 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-# From the edge of a limit switch to the mechanical stop [m].
+# Distance from the edge of a limit switch to the mechanical stop [m].
 _STOP_DISTANCE = 0.003
 
 
@@ -20,11 +20,11 @@ class MotorSettings:
     max_speed : float
         Maximum speed [counts/s].
     lag : float
-        Time constant of following the demand [s]; 0: no lag.
+        Time constant of the lag behind the demand [s]; 0: no lag.
     start : float
         Position at power-up, from the home switch's edge [counts].
     travel : float
-        Distance of the edges of both limit switches [counts]; infinite without switches.
+        Distance between the edges of both limit switches [counts]; infinite without switches.
     """
 
     counts_per_unit: float

@@ -1,4 +1,4 @@
-"""Emulated step/direction board of two stepper motors, without encoders."""
+"""Emulated step/direction board for two stepper motors without encoders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from needle_sim.drives.text_drives import TextDrive, TextDrives
 MAX_RATE = 100_000
 """Largest step rate of an axis [1/s]: a 32-bit board."""
 SILENT, LINE_LOST = 1, 2
-"""Faults: the dead-man, and a line number that does not follow the last one."""
+"""Faults: the dead-man has expired; a line number does not follow the last one."""
 _AXES = ("insertion", "rotation")
 _LINE = re.compile(r"\$((\d{1,3}),([A-Z])((?:,-?\d{1,10})*))\*([0-9A-F]{2})")
 _ON, _MOVING, _OUTER, _INNER, _SET_UP = 1, 2, 4, 8, 16
@@ -21,14 +21,14 @@ _DEAD_MAN = 0.1
 
 
 class StepdirDrive(TextDrive):
-    """Stepper of one axis; the board counts the steps that it sends, and not those that are lost.
+    """Stepper of one axis; the board counts the steps that it sends, even if the motor loses them.
 
     Attributes
     ----------
     target : float or None
         Target of the motion [steps on the motor's scale].
     speed, deceleration : float
-        Of the motion [steps/s], and of all ramps [steps/s^2]; 0: not set up since power-up.
+        Speed of the motion [steps/s], and ramp of all motions [steps/s^2]; 0: not set up yet.
     outer : int
         Direction of the outer switch, 1 or -1.
     """
@@ -37,21 +37,21 @@ class StepdirDrive(TextDrive):
         super().__init__(name, dataclasses.replace(settings, lag=0.0))
 
     def power_up(self) -> None:
-        """Forget the set-up and the position."""
+        """Reset the set-up and the position."""
         super().power_up()
         self.zero = self.demand.position
         self.speed = self.deceleration = 0.0
         self.outer = -1
 
     def switch_off(self) -> None:
-        """Switch the motor off; the count stays."""
+        """Switch the motor off; the count remains."""
         self.powered = False
         self.target: float | None = None
         self.motor.rest()
         self.demand.hold(self.demand.position)
 
     def fail(self, code: int) -> None:
-        """Brake, and hold the place with a fault."""
+        """Brake, and hold the position with a fault."""
         self.fault = code
         self.target = None
 
@@ -93,19 +93,19 @@ class StepdirDrive(TextDrive):
 
 
 class StepdirDrives(TextDrives[StepdirDrive]):
-    """Board with its motors; the sketch `stepdir.ino` describes its lines.
+    """Board with its motors; the sketch `stepdir.ino` describes its protocol.
 
     Parameters
     ----------
     motors : mapping of str to MotorSettings
-        Axis to its mechanics.
+        Mechanics of each axis.
     now : float
         Steady time of power-up [s].
     """
 
     port = "stepdir"
     intruder = "$7,M,0,10000,1000*7A"
-    """Line of another computer: it moves the insertion axis."""
+    """Line from another computer that moves the insertion axis."""
 
     def __init__(self, motors: Mapping[str, MotorSettings], now: float) -> None:
         self._expected = 0
@@ -128,7 +128,7 @@ class StepdirDrives(TextDrives[StepdirDrive]):
         return f"${body}*{_checksum(body):02X}\n".encode()
 
     def watch(self, now: float) -> None:
-        """Stop without lines of the computer."""
+        """Stop if the computer sends no lines."""
         if now - self._fed > self._dead_man:
             self._fail(SILENT)
 

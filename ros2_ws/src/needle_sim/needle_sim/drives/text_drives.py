@@ -1,4 +1,4 @@
-"""Emulated drives that speak lines of text over a byte stream."""
+"""Emulated drives with a text protocol over a byte stream."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class TextDrive:
     Attributes
     ----------
     zero : float
-        Place where the drive's count is 0 [true counts].
+        Position at which the drive's count is 0 [true counts].
     powered : bool
         Whether the motor holds its position; without power, friction holds it.
     fault : int
@@ -87,12 +87,12 @@ Drive = TypeVar("Drive", bound=TextDrive)
 
 
 class TextDrives(EmulatedDrives, Generic[Drive]):
-    """Drives that speak lines; a subclass defines `handle_line`, and `watch` for its own timers.
+    """Drives with a text protocol; subclasses define `handle_line`, and `watch` for their timers.
 
     Parameters
     ----------
     motors : mapping of str to MotorSettings
-        Axis to its mechanics.
+        Mechanics of each axis.
     now : float
         Steady time of power-up [s].
     make_drive : callable
@@ -101,7 +101,7 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
     Attributes
     ----------
     drives : dict of str to Drive
-        Axis to its drive.
+        Drive of each axis.
     late : float
         Delay of all replies [s].
     partial : bool
@@ -113,11 +113,11 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
     terminators = b"\n"
     """Bytes that end a line."""
     intruder = ""
-    """Line of another client that moves the insertion axis; empty: there is only one client."""
+    """Line from another client that moves the insertion axis; empty: only one client exists."""
     one_processor = True
     """Whether all axes hang and reboot together."""
     boot_time = 0.3
-    """From power-up to the first answer [s]."""
+    """Time from power-up to the first answer [s]."""
 
     def __init__(
         self,
@@ -145,7 +145,7 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
     # ---- the connection -----------------------------------------------------------------------
 
     def receive(self, batch: Sequence[bytes], now: float) -> list[bytes]:
-        """Handle bytes of the clients at steady time `now` [s]; return the immediate answers."""
+        """Handle bytes from clients at steady time `now` [s]; return the immediate answers."""
         self.advance_to(now)
         for chunk in batch:
             if self.is_cut or self._is_silent(now):
@@ -159,16 +159,16 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
         return self._due(now)
 
     def poll(self, now: float) -> list[bytes]:
-        """Advance the drives to steady time `now` [s]; return what they sent."""
+        """Advance the drives to steady time `now` [s]; return the data that they sent."""
         self.advance_to(now)
         return self._due(now)
 
     def foreign(self, line: str) -> None:
-        """Execute a command of another client."""
+        """Execute a command from another client."""
         self.handle_line(line, self._advanced_to)
 
     def intrude(self) -> bool:
-        """Let another client move the insertion axis."""
+        """Move the insertion axis as another client."""
         if self.intruder:
             self.foreign(self.intruder)
         return bool(self.intruder)
@@ -225,7 +225,7 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
             drive.boots_until = now + self.boot_time
 
     def hang(self, axis: str) -> None:
-        """Hang the processor of a drive: it is silent, and its motor ends at the set-point."""
+        """Hang the processor of a drive: it is silent, and its motor stops at the set-point."""
         for drive in self._together(axis):
             drive.hung = True
 

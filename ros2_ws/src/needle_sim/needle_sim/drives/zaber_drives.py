@@ -18,7 +18,7 @@ _STALLED = 0x8611
 # Flags in the order of their priority.
 _FLAGS = ("FV", "FO", "FS", "WL", "WR", "WH", "NI")
 _ADDRESSES = {"insertion": 1, "rotation": 2}
-# The serial number 0 tells that the devices are emulated.
+# The serial number 0 identifies emulated devices.
 _IDENTITY = {"device.id": 50952, "system.serial": 0, "version": 7.38}
 
 
@@ -34,7 +34,7 @@ class ZaberDrive(TextDrive):
     settings : dict of str to float
         Settings, which survive a loss of power.
     has_encoder : bool
-        Whether the device measures its position; otherwise a stall remains unknown.
+        Whether the device measures its position; otherwise a stall remains undetected.
     flags : set of str
         Active warning flags.
     """
@@ -53,7 +53,7 @@ class ZaberDrive(TextDrive):
         super().__init__(name, settings)
 
     def power_up(self) -> None:
-        """Start: the driver holds the motor; the position is unknown, so it counts as the last."""
+        """Start: the driver holds the motor; the unknown position counts as the upper limit."""
         super().power_up()
         self.powered, self.flags = True, {"WR"}
         self._target: float | None = None
@@ -61,7 +61,7 @@ class ZaberDrive(TextDrive):
         self.zero = self.motor.position - self.settings["limit.max"]
 
     def set_position(self, position: float) -> None:
-        """Count from the present position: a reference, although not homed."""
+        """Set the present position: a reference, although the axis is not homed."""
         self.zero = self.demand.position - position
         self.flags = self.flags - {"WR"} | {"WH"}
 
@@ -82,7 +82,7 @@ class ZaberDrive(TextDrive):
 
     @property
     def active_flags(self) -> list[str]:
-        """All active flags, the highest first."""
+        """All active flags, highest priority first."""
         flags = self.flags | (set() if self.powered else {"FO"})
         return [flag for flag in _FLAGS if flag in flags]
 
@@ -102,7 +102,7 @@ class ZaberDrive(TextDrive):
         return {**_IDENTITY, **self.settings, **switches, "pos": self.counted, **encoder}
 
     def clear(self) -> None:
-        """Acknowledge the warnings that a person acknowledges."""
+        """Clear the warnings that require acknowledgement."""
         self.fault = 0
         self.flags -= {"FV", "FS", "WL"}
 
@@ -118,7 +118,7 @@ class ZaberDrive(TextDrive):
         self._speed, self._velocity, self._homing = speed, velocity, False
 
     def order(self, words: list[str]) -> bool:
-        """Execute an order; return whether it is one."""
+        """Execute an order; return False if `words` are none."""
         match words:
             case ["stop"] | ["estop"]:
                 self.stop(at_once=words == ["estop"])
@@ -177,21 +177,21 @@ class ZaberDrives(TextDrives[ZaberDrive]):
     Parameters
     ----------
     motors : mapping of str to MotorSettings
-        Axis to its mechanics.
+        Mechanics of each axis.
     now : float
         Steady time of power-up [s].
     """
 
     port = "zaber"
     one_processor = False
-    # Line of another computer: it moves the insertion axis at 10000 counts/s.
+    # Line from another computer that moves the insertion axis at 10000 counts/s.
     intruder = "/1 1 move rel 20000 16384"
 
     def __init__(self, motors: Mapping[str, MotorSettings], now: float) -> None:
         super().__init__(motors, now, ZaberDrive)
 
     def handle_line(self, line: str, now: float) -> bytes:
-        """Execute a message; each device that it addresses replies."""
+        """Execute a message; each addressed device replies."""
         text, colon, checksum = line.partition(":")
         if not text.startswith("/") or (colon and checksum != _lrc(text[1:])):
             return b""

@@ -25,7 +25,7 @@ class NeedleShape:
     diameter : float
         Diameter of the shaft [m].
     bend_angle : float
-        Angle between shaft and distal segment, above `lean` [rad].
+        Angle between shaft and distal segment, greater than `lean` [rad].
     bend_distance : float
         Distance from the bend to the tip [m].
     lean : float
@@ -88,7 +88,7 @@ class NeedleShape:
         centreline : ndarray, shape (N, 3)
             Path of the tip in `rig`, from the entry point to the tip [m].
         spacing : float
-            Maximum distance of neighbouring points [m].
+            Maximum distance between neighbouring points [m].
 
         Returns
         -------

@@ -24,7 +24,7 @@ class Channel:
     T_rig_entry : ndarray, shape (4, 4)
         Pose of the tip frame in `rig` at inserted length 0.
     entry_angle : float
-        Angle of the tip there [rad].
+        Angle of the tip at the entry [rad].
     """
 
     def __init__(self, T_rig_entry: FloatArray, entry_angle: float) -> None:  # noqa: N803
@@ -129,7 +129,7 @@ class NeedlePlant:
 
     A retracted needle follows its path in reverse: position and heading are those of the path, and
     the tip is rotated about its axis by the base rotation (after torsion) since it cut the path
-    there. Pushed again, the needle follows the same channel to its end and cuts on from there. A
+    there. Inserted again, the needle follows the same channel and continues cutting at its end. A
     withdrawn needle (within 1 um, the accuracy of summed increments) leaves the channel: the next
     insertion cuts a new one at the same entry point. Outside, it moves straight along its heading.
 
@@ -187,7 +187,7 @@ class NeedlePlant:
         Parameters
         ----------
         d_insertion : array_like, shape (...)
-            Insertion of the base [m]; negative retracts the needle (one needle only).
+            Insertion of the base [m]; a negative value retracts the needle (one needle only).
         d_rotation : array_like, shape (...)
             Rotation of the base over that insertion [rad].
 
@@ -213,7 +213,7 @@ class NeedlePlant:
         Parameters
         ----------
         spacing : float
-            Maximum distance of neighbouring points along the path [m].
+            Maximum distance between neighbouring points along the path [m].
 
         Returns
         -------

@@ -138,14 +138,14 @@ class Appearance:
 
 @dataclasses.dataclass(frozen=True)
 class NamedAppearance:
-    """Named appearance: fixes some properties, the others are drawn.
+    """Named appearance with some fixed properties; the others are drawn.
 
     Attributes
     ----------
     summary : str
-        One line for the user.
+        Description for the user.
     metal, lamps, floor : str or None
-        Fixed value; None is drawn.
+        Fixed value; None: drawn at random.
     needle : bool
         Whether the images show a needle.
     """
@@ -194,7 +194,7 @@ APPEARANCES = {
         "no needle: bubbles, lint, print; all drawn from the seed", needle=False
     ),
 }
-"""Name to fixed properties."""
+"""Fixed properties by name."""
 
 
 def draw_appearance(name: str, seed: int) -> Appearance:
@@ -221,7 +221,7 @@ def draw_appearance(name: str, seed: int) -> Appearance:
         return float(rng.uniform(lower, upper))
 
     def sometimes(share: float, lower: float, upper: float) -> float:
-        """Return a number between the bounds in a share of all cases, else 0."""
+        """Return a number between the bounds with probability `share`, else 0."""
         value = between(lower, upper)
         return value if rng.random() < share else 0.0
 

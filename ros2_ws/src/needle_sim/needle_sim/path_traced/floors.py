@@ -23,7 +23,7 @@ _WORDS = ("needle", "phantom", "gel 35 mm", "sample 04", "do not shake", "lot 2.
 
 
 def floor_picture(floor: Floor, rng: np.random.Generator) -> FloatImage:
-    """Return the reflectance of a random floor of a kind; brightness of a lit panel.
+    """Return the reflectance of a random floor of a kind, or the brightness of a lit panel.
 
     Parameters
     ----------

@@ -171,7 +171,7 @@ TRUTH_COLUMNS = (
     *("face_x_mm", "face_y_mm", "face_z_mm", "heading_x", "heading_y", "heading_z"),
     *("bevel_length_mm", "diameter_mm", "light", "bottom", "needle", "bubbles"),
 )
-"""End of the axis (the tip), foremost point of the metal, centre of the bevel, heading, ..."""
+"""Columns: end of the axis (the tip), foremost point of the metal, centre of the bevel, ..."""
 
 
 def truth_values(appearance: Appearance, pair: TracedPair) -> list[float | str]:

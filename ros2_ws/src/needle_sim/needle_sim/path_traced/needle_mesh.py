@@ -1,4 +1,4 @@
-"""Triangle mesh of the needle: a tube along a bent centreline, with a bevel at its needle."""
+"""Triangle mesh of the needle: a tube along a bent centreline, with a bevel at its end."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def needle_mesh(line: FloatArray, sharp_side: FloatArray, needle: Appearance) ->
 
     The last point of the line is the end of the axis, level with the foremost point of the metal.
     The plane of the bevel contains the foremost point and meets the axis half the bevel's length
-    behind its needle.
+    behind its end.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def needle_mesh(line: FloatArray, sharp_side: FloatArray, needle: Appearance) ->
     """
     axis = _Axis(line, sharp_side)
     radius = needle.diameter / 2.0
-    # Denser at the bent and bevelled needle.
+    # Denser at the bent and bevelled end.
     station = axis.length * (1.0 - (1.0 - np.linspace(0.0, 1.0, _STATIONS)) ** 1.5)
     angle = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
     # Arc length at which the bevel cuts the tube at each angle; stations beyond it coincide.

@@ -20,17 +20,17 @@ _UNDISTORTING_STEPS = 14
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rays:
-    """Lines of sight from where they enter the phantom, or pass it.
+    """Lines of sight, from the points where they enter or miss the phantom.
 
     Attributes
     ----------
     origin : ndarray, shape (..., 3)
-        Start on the window's inner face, in `rig`; on the outer face if the ray passes the phantom
+        Start on the window's inner face, in `rig`; on the outer face if the ray misses the phantom
         [m].
     direction : ndarray, shape (..., 3)
         Unit vector in `rig`, behind that face.
     in_air : ndarray of bool, shape (...)
-        Whether the line of sight passes the phantom without refraction.
+        Whether the line of sight misses the phantom and is not refracted.
     """
 
     origin: FloatArray
@@ -85,7 +85,7 @@ def refracted_rays(pixels: ArrayLike, camera: SimulatedCamera, rig: StereoRig) -
 
 
 def _refracted(flat: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return unit vectors against a normal with a tangential component (..., 3)."""
+    """Return unit vectors against a normal, with the tangential component `flat`, (..., 3)."""
     return np.asarray(flat - np.sqrt(1.0 - (flat**2).sum(axis=-1))[..., np.newaxis] * normal)
 
 
@@ -192,8 +192,8 @@ class PathTracer:
     ) -> list[FloatArray]:
         """Return the direct light from above on points, in each of several scenes.
 
-        It comes from lamps and room without reflections. All scenes use the same samples, so that
-        their ratio shows shadows without noise.
+        The light comes from lamps and room without reflections. All scenes use the same samples, so
+        that their ratio shows shadows without noise.
 
         Parameters
         ----------

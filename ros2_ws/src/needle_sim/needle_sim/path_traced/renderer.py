@@ -93,13 +93,13 @@ class PathTracedRenderer:
     picture times the light on it, which is sampled on a grid with and without the needle, for the
     needle's shadow. Objects in front of it (needle, bubbles, walls) are path-traced, with their
     share of each pixel. Lint, earlier paths and the edges of a box are drawn on the backdrop. Haze
-    fades all layers by their distance; then follow its glow, blur, blooming and noise.
+    fades all layers by their distance; its glow, blur, blooming and noise are applied last.
 
     Shape and position of all traced objects are exact: lines of sight obey Snell's law at each
     layer of a camera's window; the phantom begins at z = 0, a box ends at its walls.
-    Approximations: lamps are at their apparent position from the phantom's centre through a level
-    top, also for a box; the surface mirrors a ring of constant brightness into the phantom, nothing
-    in a box; walls and needle do not light the floor; bubbles cast shadows without caustics; haze
+    Approximations: lamps are where they appear from the phantom's centre through a level
+    top, also for a box; the surface mirrors a ring of constant brightness into the phantom, but not
+    into a box; walls and needle do not light the floor; bubbles cast shadows without caustics; haze
     is one exponential with a glow of one width; windows do not reflect; all floors are Lambertian;
     the background of a box is a flat picture in gel, lit from above and from the front.
 
@@ -287,7 +287,7 @@ class _View:
     floor_points : ndarray, shape (rows, columns, 3)
         Intersections of the lines of sight with the backdrop, in `rig` [m].
     in_air : ndarray of bool, shape (rows, columns)
-        Whether a line of sight passes the phantom.
+        Whether a line of sight misses the phantom.
     veil : float
         Radiance of haze.
     floor : ndarray of float32, shape (rows, columns)

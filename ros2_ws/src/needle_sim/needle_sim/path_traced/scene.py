@@ -72,7 +72,7 @@ class Scene:
         self._parameters = self._mi.traverse(self.tracer)
 
     def update_needle(self, needle: dict[str, Mesh]) -> None:
-        """Set a new shape of the needle."""
+        """Update the shape of the needle."""
         for name, mesh in needle.items():
             self._set(self._parameters, f"{name}.", mesh)
         self._parameters.update()

@@ -1,4 +1,4 @@
-"""Loads Mitsuba 3, an optional dependency; a missing one is a one-line error."""
+"""Loading of Mitsuba 3, an optional dependency; a missing one is reported in one line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HINT = "docs/dependencies.md says how to install it"
 
 
 class Mitsuba(NamedTuple):
-    """Modules of the tracer, which have no types.
+    """Modules of the tracer, without type annotations.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Mitsuba(NamedTuple):
 def load_mitsuba() -> Mitsuba:
     """Return the tracer.
 
-    It uses the LLVM library in DRJIT_LIBLLVM_PATH, or the newest one of the system.
+    It uses the LLVM library in DRJIT_LIBLLVM_PATH, or the newest one on the system.
 
     Raises
     ------

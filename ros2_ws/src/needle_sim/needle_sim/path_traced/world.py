@@ -104,7 +104,7 @@ def backdrop(
 
 
 MIDDLE = np.array([0.0, 0.0, 0.06])
-"""Centre of the visible phantom in `rig`, to which lamps point [m]."""
+"""Centre of the visible phantom in `rig`, at which lamps point [m]."""
 
 # Angles from the vertical over MIDDLE: across the needle (either side), along it; distance [m].
 _ACROSS = np.deg2rad([8.0, 60.0])
@@ -124,7 +124,7 @@ class Lamp:
     centre : ndarray, shape (3,)
         Centre in `rig`, in air [m].
     half_sides : pair of float
-        Half sides; the second is about parallel to the needle, unless `turned` [m].
+        Half sides; the second is roughly parallel to the needle, unless `turned` [m].
     turned : bool
         Whether the sides are exchanged.
     radiance : float
@@ -161,7 +161,7 @@ def apparent_centre(lamp: Lamp, rig: StereoRig) -> FloatArray:
     """Return the apparent position of a lamp from the centre of the phantom, (3,) in `rig` [m].
 
     It keeps its horizontal position and appears higher, because refraction makes the light steeper
-    inside. The top is level and without layers, independent of the cameras' windows.
+    inside. The top is level and without layers, regardless of the cameras' windows.
     """
     up, index = np.array([1.0, 0.0, 0.0]), refractive_index(rig)
     top = SimulatedWindow(up, rig.half_height, (), (index,))

@@ -74,7 +74,7 @@ class _CommandLines:
         while not self._is_closed:
             if not select.select([terminal], [], [], _WAKE_UP_PERIOD)[0]:
                 continue
-            # Input for the shell in the foreground is not for a program in its background.
+            # While this program runs in the background, terminal input belongs to the shell.
             if os.isatty(terminal) and os.tcgetpgrp(terminal) != os.getpgrp():
                 continue
             data = os.read(terminal, 4096)

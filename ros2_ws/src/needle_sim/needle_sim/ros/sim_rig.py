@@ -30,7 +30,7 @@ Services    levels tip and camera: device/{home,retract,stop,reset},
 def _make(settings: SimRigParameters, name: str) -> SimRig:
     if settings.level == "tip":
         return SimRig(settings, name, now=time.monotonic())
-    # Loading the renderer takes long, and level tip does not need it.
+    # Loading the renderer takes a long time, and level tip does not need it.
     from needle_sim.cameras import PublishedRemoteCameras  # noqa: PLC0415
 
     return SimRig(settings, name, PublishedRemoteCameras, time.monotonic())

@@ -22,7 +22,7 @@ _GEL = (1.33, 1.42)
 _TILT = 0.005  # standard deviation of a wall's tilt [rad]
 _BEFORE_ENTRY_PX = (15.0, 70.0)  # distance of the needle's entry from the image border
 _MAX_OFFSET = 0.012  # of a camera from the centre of its view [m]
-_ROLL = 0.03  # standard deviation of its roll [rad]
+_ROLL = 0.03  # standard deviation of a camera's roll [rad]
 
 
 def draw_box(seed: int) -> str:

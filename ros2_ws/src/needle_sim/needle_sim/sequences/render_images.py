@@ -129,7 +129,7 @@ def _look(given: argparse.Namespace, seed: int) -> Scenario | Appearance:
 
 
 def _calibration(given: argparse.Namespace, seed: int, folder: Path) -> Path:
-    """Return the calibration: of a box, which is written into a folder, given or shipped."""
+    """Return the calibration file: given, shipped, or of a box, which is written into `folder`."""
     if given.box:
         if given.calibration is not None:
             raise UserError("--box generates its own calibration: omit --calibration")

@@ -1,6 +1,6 @@
 """Disturbances of a study (measurements, tissue, needle) and the random numbers behind them.
 
-The controller does not know any of them.
+None of them is passed to the controller.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def random_directions(numbers: NDArray[np.float32]) -> FloatArray:
 
 
 Insertion = TypeVar("Insertion", float, FloatArray)
-"""Insertion of all needles, or of each."""
+"""Insertion common to all needles, or one for each."""
 PATCH_LENGTH = 0.020
 """Insertion over which the curvature is constant [m]."""
 _NEGLIGIBLE = 1e-6
@@ -101,7 +101,7 @@ class Disturbances:
     bias_walk : float
         Maximum bias of a measured coordinate; the bias walks by a tenth of it per exposure [m].
     outliers : float
-        Share of outliers, which are off in a random direction.
+        Share of outliers, which deviate in a random direction.
     outlier_size : tuple of float
         Minimum and maximum distance of an outlier, uniform in between [m].
     found : float
@@ -109,7 +109,7 @@ class Disturbances:
     delay : int
         Delay of a measurement in steps; the controller receives its age.
     untold_delay : int
-        Delay in steps that the controller does not know: the measurement appears to be new.
+        Delay in steps that is hidden from the controller: the measurement appears to be new.
     curvature_scale : float
         Curvature of the plant as a multiple of the controller's assumption.
     curvature_patches : float
@@ -117,8 +117,8 @@ class Disturbances:
     layer : tuple of float
         Factor of the curvature in a layer of tissue, and insertion at which the layer begins [m].
     push : float
-        Curvature by which the tissue bends the path towards a direction across z, which is fixed in
-        space and drawn for each needle [1/m].
+        Curvature by which the tissue bends the path towards a direction perpendicular to z, which
+        is fixed in space and drawn for each needle [1/m].
     rotation_gain : float
         Share of the base rotation that reaches the tip, before play and lag.
     roll_walk : float
@@ -218,7 +218,7 @@ def bumps(distance: float, seed: int, first: int, count: int) -> FloatArray:
 def push_axes(push: float, seed: int, first: int, count: int) -> FloatArray:
     """Return the rotation of each needle's heading per inserted length, (count, 3) [rad/m].
 
-    It turns a heading along z towards a random direction across z.
+    It rotates a heading along z towards a random direction perpendicular to z.
     """
     around = 2.0 * np.pi * uniform_numbers(seed, PUSH, 0, first, count)[:, 0]
     return np.asarray(push * np.stack([-np.sin(around), np.cos(around), 0.0 * around], axis=-1))
@@ -262,7 +262,7 @@ class BiasWalk:
 
 
 class DelayLine:
-    """Delays measurements by some steps.
+    """Delays measurements by a number of steps.
 
     The first measurement is not delayed; then nothing arrives until the second one is due.
 
@@ -319,7 +319,7 @@ def _normal_errors(lasting: float, seed: int, exposure: int, first: int, count: 
         left = lasting**back
         if left < _NEGLIGIBLE:
             break
-        # The first one has the stationary variance.
+        # The error of exposure 0 has the stationary variance.
         left *= 1.0 if back == exposure else math.sqrt(1.0 - lasting * lasting)
         share = uniform_numbers(seed, NOISE, exposure - back, first, count)
         errors += left * normal_numbers(share[:, :3])

@@ -97,7 +97,7 @@ def is_doubtful(missed: FloatArray) -> FloatArray:
 
 
 FAR_OFF = 5e-3
-"""Distance from plane or point beyond which the end of a run must be doubtful [m]."""
+"""Distance from plane or point beyond which the end of a run should count as doubtful [m]."""
 LAST_STEPS = 20
 """Number of final steps that are evaluated."""
 
@@ -154,7 +154,7 @@ class Outcomes:
 
     @property
     def diverged(self) -> BoolArray:
-        """Whether a run that missed ended farther off than it started, and moving away."""
+        """Whether a run that missed ended farther from the plane than it started, moving away."""
         end = np.abs(self.x_end)
         away = (end > np.abs(self.x_start)) & (end > np.abs(self.x_last[:, 0]))
         return np.asarray(~self.converged_at_end & away)
@@ -267,12 +267,12 @@ def mean_or_none(values: FloatArray) -> float | None:
 
 
 def trusted_far_off(distance: FloatArray, missed: FloatArray) -> float | None:
-    """Return the number of runs that end beyond `FAR_OFF` without doubt; None without estimates.
+    """Return the number of undoubted runs that end beyond `FAR_OFF`; None without estimates.
 
     Parameters
     ----------
     distance : ndarray, shape (N,)
-        Distance from plane or point at the end, with either sign [m].
+        Distance from plane or point at the end, of either sign [m].
     missed : ndarray, shape (N,)
         See `Outcomes`.
     """

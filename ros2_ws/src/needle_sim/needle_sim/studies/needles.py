@@ -227,7 +227,7 @@ class DisturbedNeedles:
     curvature : float
         Curvature that the controller assumes [1/m].
     bump_at : float
-        Insertion at which the phantom is moved, if it is [m].
+        Insertion at which a bump, if any, moves the phantom [m].
     seed, first : int
         Keys of the random numbers: seed of the study, first needle.
 

@@ -29,7 +29,7 @@ from needle_sim.studies.needles import DisturbedNeedles
 from needle_sim.studies.study import CHUNK, Controller, StudySettings, needle_chunks
 
 NEAREST, FARTHEST = 0.060, 0.120
-"""Distance of the points ahead of the starts [m]."""
+"""Bounds on the distance of the points ahead of the starts [m]."""
 CURVATURE_SHARE = 0.6
 """Maximum curvature of the arc from the true start to a point, as a share of the
 needle's. The margin is needed because the roll is unknown over the first centimetres."""
@@ -114,7 +114,7 @@ ARRIVED = 1e-4
 
 
 class PointController(Controller, Protocol):
-    """Controller of some needles that knows the remaining insertion of each.
+    """Controller of some needles that computes the remaining insertion of each.
 
     It receives the targets before its start and before each step.
     """
@@ -184,7 +184,7 @@ def run_point_study(
     Returns
     -------
     PointOutcomes
-        In the order of the starts.
+        Outcomes in the order of the starts.
     """
     parts = []
     chunks = needle_chunks(starts, settings, bump_at=0.5 * NEAREST, chunk=chunk, begin=first)

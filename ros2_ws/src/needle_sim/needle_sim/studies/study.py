@@ -69,7 +69,7 @@ CHUNK = 500
 class Controller(Protocol):
     """Controller of some needles, which are the leading axis of all arrays.
 
-    A last tip is measured after the last step, as by the node.
+    A final tip is measured after the last step, as in the node.
     """
 
     def start(self, tips: FloatArray) -> FloatArray:
@@ -168,7 +168,7 @@ def run_study(
     Returns
     -------
     Outcomes
-        In the order of the starts.
+        Outcomes in the order of the starts.
     """
     chunks = needle_chunks(starts, settings, bump_at=0.5 * settings.depth, chunk=chunk, begin=first)
     return concatenate(
@@ -212,7 +212,7 @@ def _steer(
         reached = min(step * settings.step_length, settings.depth)
         length = reached - insertion
         turned = rate * length
-        # The rotation ends with the step, wherever it starts.
+        # The rotation ends with the step, whenever it starts.
         turns_from = insertion + min(settings.turn_delay, 0.9 * length)
         if turns_from > insertion:
             needles.insert(insertion, turns_from, turns_from - insertion, 0.0 * turned)
