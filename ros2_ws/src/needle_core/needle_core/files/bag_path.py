@@ -1,4 +1,4 @@
-"""Paths of bags: recognises bags and their files, and explains why one cannot be read."""
+"""Detection of bags and their files, and errors that explain why a bag cannot be read."""
 
 from __future__ import annotations
 
