@@ -1,4 +1,4 @@
-"""Parts of the rig that process the messages of a bag, and their outputs."""
+"""Stages of the rig that process the messages of a bag, and their outputs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONVERTER = Converter(rosbags_types(_STORE))
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """A message of the current code.
+    """Message from the current code.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Output:
     stamp : int
         Stamp of the message [ns].
     message : Any
-        The message, of rosbags' class.
+        The message, as an object of rosbags.
     """
 
     topic: str
@@ -55,7 +55,7 @@ class Output:
 
 
 class Stage(Protocol):
-    """A part of the rig that turns messages into outputs."""
+    """Part of the rig that turns messages into outputs."""
 
     @property
     def topics(self) -> frozenset[str]:
@@ -72,14 +72,14 @@ class Stage(Protocol):
 
 
 class BagStage:
-    """A component that processes recorded messages.
+    """Stage that runs a component on recorded messages.
 
     Parameters
     ----------
     component : Component
         The component.
     received : iterable of str
-        Its output topics that have a subscriber.
+        Output topics of the component that have a subscriber.
 
     Attributes
     ----------
