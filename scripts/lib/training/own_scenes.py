@@ -31,8 +31,8 @@ _SHORT = 10e-3  # assumed needle length to compute the width in images without a
 def own_scenes(folder: Path, width: float) -> tuple[TracedScene, TracedScene]:
     """Return the training scene and the held-out scene of a recording.
 
-    The needle follows its tip, so the path of the accepted tips gives the shaft in each image, also
-    in the pairs between them without a tip.
+    The needle follows its tip, so the path of the accepted tips gives the shaft in each image,
+    including those between them without a tip.
 
     Parameters
     ----------

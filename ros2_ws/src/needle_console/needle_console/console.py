@@ -63,7 +63,7 @@ _HOLD, _PLANE, _POINT, _RIG = "device/hold", "target_plane", "target_point", "ri
 _PROPOSED_TARGET = "needle/proposed_target"
 _SHOW_PERIOD, _CHECK_PERIOD = 0.1, 1.0
 _HOLD_SERVER_TIMEOUT = 1.0
-"""Time without a report after which the hold's server has failed; it reports at 12 Hz [s]."""
+"""Time after which the hold's server, which reports at 12 Hz or more, counts as failed [s]."""
 _VIEW_TIMEOUT = 2.0
 """Time within which an open page requests its views again [s]."""
 _LAG_INCREASE = 0.05

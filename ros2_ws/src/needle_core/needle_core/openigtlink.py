@@ -23,7 +23,7 @@ _MASK, _POLYNOMIAL = (1 << 64) - 1, 0x42F0E1EBA9EA3693
 
 
 class LinkMessage(NamedTuple):
-    """A message: version of its header, type, device name, stamp [s] since 1970 (0: none), body."""
+    """Message with header version, type, device name, stamp [s] since 1970 (0: none) and body."""
 
     version: int
     kind: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# A gap counts as loss once this many messages have arrived after it.
+# A gap is final once this many messages have arrived after it.
 CERTAIN_AFTER = 5
 
 
@@ -10,8 +10,8 @@ class SequenceGaps:
     """Gaps in the sequence numbers of a topic with one publisher.
 
     Every publisher counts from 1, and messages do not identify their publisher. A jump may
-    therefore be the first message of a second, not yet discovered publisher; it is if the numbers
-    before the jump continue.
+    therefore be the first message of a second publisher that has not been discovered yet. This is
+    the case if the numbers before the jump continue.
     """
 
     def __init__(self) -> None:

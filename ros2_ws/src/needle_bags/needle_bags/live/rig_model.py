@@ -37,7 +37,7 @@ def rig_urdf(calibration: StereoCalibration, limits: SafetyLimits, diameter: flo
     Parameters
     ----------
     calibration : StereoCalibration
-        Cameras and windows. The phantom is drawn with the needle's axis in its middle.
+        Cameras and windows. The phantom is drawn centred on the needle's axis.
     limits : SafetyLimits
         Range and speed of the joints.
     diameter : float

@@ -95,7 +95,7 @@ def recover_bag(path: Path) -> BagRecovery:
     Parameters
     ----------
     path : Path
-        The bag's directory or one of its files; or a file that is read alone.
+        Directory of the bag, one of its files, or a file to repair alone.
 
     Raises
     ------

@@ -63,7 +63,7 @@ class Stage(Protocol):
         ...
 
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Process a message of a topic, by its relative name; return the outputs."""
+        """Process a message of a topic, given by relative name; return the outputs."""
         ...
 
     def finish(self, log_time: int) -> list[Output]:
@@ -99,7 +99,7 @@ class BagStage:
         return frozenset(self._rows)
 
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Process a message of a topic, by its relative name; return the outputs."""
+        """Process a message of a topic, given by relative name; return the outputs."""
         row, at = self._rows[topic], Moment(sent.time * 1e-9, sent.time, sent.time)
         plain = plain_image(message) if row.message is Image else message
         published = self.runner.deliver(row.topic, from_ros(row.message, plain), at)

@@ -90,7 +90,7 @@ class ControllerStage:
         return frozenset(self._handlers)
 
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Process a message of a topic, by its relative name; return the outputs."""
+        """Process a message of a topic, given by relative name; return the outputs."""
         outputs = []
         for action in self._handlers[topic](message, sent.time):
             if not isinstance(action, Publish) or action.topic == STATUS:

@@ -67,7 +67,7 @@ the bag cannot be created
 """
 
 GRAPH_PERIOD = 0.1
-# After the signal, record until no message has arrived for DRAIN_QUIET, at most DRAIN_LIMIT [s].
+# After the signal, record until no message arrives for DRAIN_QUIET, but at most DRAIN_LIMIT [s].
 DRAIN_QUIET = 0.3
 DRAIN_LIMIT = 1.0
 REPORT_PERIOD = 0.5

@@ -193,7 +193,7 @@ def reached_depth(run: Run) -> bool:
 
 
 def stop_cause(run: Run) -> str:
-    """Return why the insertion stopped: the first reason reported after the last steering.
+    """Return the cause of a stop of the insertion: the first reason reported after steering.
 
     Later reports, such as that of a disabled device, are consequences.
     """

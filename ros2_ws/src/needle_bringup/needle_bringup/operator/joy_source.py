@@ -37,7 +37,7 @@ class JoySource:
         Parameters
         ----------
         axes, buttons : sequence
-            As in sensor_msgs/Joy.
+            Axes and buttons as in sensor_msgs/Joy.
         now : float
             Steady time of arrival [s].
         stamp : float

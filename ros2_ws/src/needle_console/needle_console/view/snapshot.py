@@ -106,5 +106,5 @@ class Snapshot:
 
 
 def stop_reason(device: DeviceStatus) -> str:
-    """Return a device's fault, or the reason of its last stop, refusal or wait; empty if none."""
+    """Return a device's fault, or the reason for its last stop, refusal or wait; empty if none."""
     return device.fault or device.reason

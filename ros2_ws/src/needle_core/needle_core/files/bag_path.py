@@ -52,8 +52,8 @@ def repair_hint(path: Path) -> str:
 def recording_files(folder: Path) -> list[Path]:
     """Return the files of a folder's only MCAP recording: `<stem>.mcap` or `<stem>_<n>.mcap`.
 
-    Of several stems, the one with the folder's name is the recording. If numbers are missing in
-    the sequence, the result includes the first missing file, which does not exist.
+    If there are several stems, the one with the folder's name is the recording. If numbers are
+    missing in the sequence, the result includes the first missing file, which does not exist.
 
     Raises
     ------
