@@ -102,7 +102,7 @@ class Driver:
 
 
 class PlainSlcan:
-    """Client that uses python-can's slcan bus, and its Notifier for the answers."""
+    """Client that uses python-can's slcan bus, with its Notifier for the answers."""
 
     def __init__(self, channel: str) -> None:
         self._bus = can.Bus(interface="slcan", channel=channel, bitrate=BITRATE, sleep_after_open=0)

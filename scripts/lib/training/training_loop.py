@@ -25,7 +25,7 @@ from training_net import (
 
 _BATCH, _DECAY = 16, 1e-4
 _RATE, _TUNING_RATE = 3e-3, 3e-4  # maximum learning rate of a new net and of a trained one
-_WARM_UP, _FIRST_RATE, _LAST_RATE = 0.08, 0.04, 0.002  # share of the run, and of the rate
+_WARM_UP, _FIRST_RATE, _LAST_RATE = 0.08, 0.04, 0.002  # share of the run; shares of the rate
 _END_WEIGHT = 0.04  # weight of the loss of ends relative to the loss of the shaft
 _LARGEST_STEP = 2.0  # maximum norm of the gradients
 _WORST, _MOST_BAD = (1.0, 30.0), 20  # losses above which a batch is skipped; consecutive skips

@@ -47,7 +47,7 @@ interrupted
 """
 _STEP, _STEP_TIME, _SETTLED = 0.002, 0.41, 1.5
 _WAY = 0.01
-# Age of joint_states, by which a motion may be measured too long [s].
+# Maximum age of joint_states, which makes a measured motion too long [s].
 _JOINTS_AGE = 2.0 * PERIOD
 # Faults that the command triggers itself, and those that the person causes.
 _OWN = ("release", "silent hold", "emergency stop", "device/stop", "frozen driver")
@@ -90,7 +90,7 @@ class Bench(ConformanceRig):
     settings : DeviceDriverParameters
         Parameters of the driver.
     pedal : OperatorParameters or None
-        Parameters of the person's pedal; None for emulated drives, where this command holds.
+        Parameters of the person's pedal; None for emulated drives, which need no person.
     bag : Path
         Bag to record into.
     """

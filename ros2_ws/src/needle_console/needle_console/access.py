@@ -137,7 +137,7 @@ class Gate:
 
 
 def _forbid_framing(send: _Send) -> _Send:
-    """Forbid other pages to embed this page, as they could redirect a press to it."""
+    """Prevent other pages from embedding this one, which could redirect a press to it."""
 
     async def send_with_header(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":

@@ -91,7 +91,7 @@ class PeerTopic:
         return self.message(*([stamp_ns, self.frame] if self.stamped else []), pairs[0][0])
 
     def received(self, message: m.Point | m.BarePoint) -> m.Vector3:
-        """Return a received point in `rig` [m]; raise a `UserError` if its frame is another."""
+        """Return a received point in `rig` [m]; raise a `UserError` if it has another frame."""
         if isinstance(message, m.Point) and message.frame_id not in ("", self.frame):
             raise UserError(f"its frame is '{message.frame_id}', expected '{self.frame}'")
         position = np.array(message.position) / _UNITS[self.unit]

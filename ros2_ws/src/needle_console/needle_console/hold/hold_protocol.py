@@ -187,7 +187,7 @@ class HoldProtocol:
         return "" if is_free else OTHER_PAGE
 
     def _end_if_stale(self, now: float) -> None:
-        """End an expired hold; every method calls this, as any may be the first after a stall."""
+        """End an expired hold; after a stall, the first method that runs does this."""
         if self._owner is not None and self._pages[self._owner].session.end_if_stale(now):
             self._pages[self._owner].why = _STALLED
             self.refuse(HoldRefusal.LOST, "no recent message from the page; press again")

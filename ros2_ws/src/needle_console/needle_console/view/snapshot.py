@@ -72,7 +72,7 @@ class Snapshot:
     tip : MeasuredTip or None
         The last measured tip.
     tip_lost_for : float
-        Time since the cameras lost the tip [s]; 0 if they track it.
+        Time since the cameras lost the tip [s]; 0 if they have not lost it.
     T_rig_plane : ndarray, shape (4, 4)
         Frame of the target plane [m].
     track : tuple of TrackPoint

@@ -34,7 +34,7 @@ MAX_LENGTH = 128  # of a printed array or text
 
 
 def spin_until(node: Node, condition: Callable[[], Any], timeout: float, failure: str = "") -> None:
-    """Spin until the condition holds (never for `bool`); after the timeout [s], raise `failure`."""
+    """Spin until a condition holds (`bool` never does); raise any `failure` at the timeout [s]."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() >= end:
