@@ -25,7 +25,7 @@ _NO_CODE = {
 
 
 def code_lines(source: str) -> int:
-    """Return how many lines of a module hold code: no blanks, comments or docstrings."""
+    """Return the number of lines with code in a module, without blanks, comments and docstrings."""
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type not in _NO_CODE:
@@ -39,7 +39,7 @@ def code_lines(source: str) -> int:
 
 
 def modules(root: Path) -> list[Path]:
-    """Return all modules of a checkout: those of its packages, scripts and tests."""
+    """Return all modules in a checkout's packages, scripts and tests."""
     folders = ("ros2_ws/src", "scripts", "tests")
     return sorted(module for folder in folders for module in (root / folder).rglob("*.py"))
 
@@ -50,7 +50,7 @@ def is_test(module: Path, root: Path) -> bool:
 
 
 def count(root: Path) -> Counter[str]:
-    """Return the lines of code by package, scripts among them, without tests."""
+    """Return the lines of code by package and of the scripts, without tests."""
     lines: Counter[str] = Counter()
     for module in modules(root):
         if not is_test(module, root):

@@ -31,7 +31,7 @@ CALIBRATION = (
 
 
 def controllers() -> None:
-    """Each preset as the node has it, and in a study."""
+    """Compile each preset as used in the node and in a study."""
     for preset in PRESETS:
         PlaneControl(SteeringSettings(preset=preset, **PAPER_NOISE), offset_plane(0.003))
         settings = StudySettings(
@@ -45,7 +45,7 @@ def controllers() -> None:
 
 
 def tracker() -> None:
-    """Acquisition and tracking of a needle."""
+    """Compile the acquisition and tracking of a needle."""
     calibration = load_calibration(CALIBRATION)
     settings = StereoTrackerParameters()
     rig = load_stereo_rig(CALIBRATION)

@@ -1,7 +1,7 @@
-"""An import-linter contract: ROS stays in the rooms called `ros`.
+"""Contract of import-linter: only subpackages called `ros` may import ROS.
 
-Every other module of the given packages is pure, modules that do not exist yet included: it imports
-neither ROS nor a module of such a room, so that no chain of imports leads to ROS either.
+Every other module of the given packages, including future ones, is pure: it imports neither ROS nor
+a module of such a subpackage, so that no chain of imports leads to ROS.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ ROS = re.compile(r"rclpy|rosidl_.*|launch|launch_ros|.*_msgs|.*_interfaces|std_s
 
 
 def is_in_room(module: str) -> bool:
-    """Return whether a module is in its package's room `ros`."""
+    """Return whether a module is in its package's subpackage `ros`."""
     return module.split(".")[1:2] == ["ros"]
 
 
@@ -26,12 +26,12 @@ def is_ros(module: str) -> bool:
 
 
 class RosRoomContract(Contract):
-    """Pure modules import neither ROS nor a module of a room `ros`."""
+    """Contract that pure modules import neither ROS nor a module of a subpackage `ros`."""
 
     packages = fields.ListField(subfield=fields.StringField())
 
     def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
-        """Return each import by which a pure module reaches for ROS."""
+        """Return each import that leads from a pure module to ROS."""
         ours = tuple(str(name) for name in cast("list[str]", self.packages))
         broken = []
         for importer in sorted(graph.modules):
@@ -47,7 +47,7 @@ class RosRoomContract(Contract):
         return ContractCheck(kept=not broken, metadata={"broken": broken})
 
     def render_broken_contract(self, check: ContractCheck) -> None:
-        """Print the imports that break the wall."""
+        """Print the imports that break the contract."""
         output.print_error("Only modules of the rooms `ros` may import ROS or each other:")
         output.new_line()
         for line in check.metadata["broken"]:

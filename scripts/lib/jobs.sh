@@ -1,8 +1,8 @@
-# Sourced by the scripts that start others: a signal that ends a script ends what it runs, at once.
+# Sourced by scripts that start other programs: a signal that ends a script ends its child at once.
 # shellcheck shell=bash
 
-# Children run as jobs with process groups of their own, so that a signal reaches this shell at once and it can
-# pass it on, whatever it is doing.
+# Children run as jobs in their own process groups, so that a signal reaches this shell at once, and the shell can
+# forward it in any state.
 set -m
 child=
 interrupted=
@@ -27,14 +27,14 @@ run() {
     [ -z "$interrupted" ] || exit 130
 }
 
-# Set the checkout up with these extras where that is not done, and enter its environment: $here is its folder of scripts.
+# Set up the checkout with these extras if necessary, and enter its environment; $here is its folder of scripts.
 enter() {
     run "$here/setup" --quiet "$@"
     [ "$code" = 0 ] || exit "$code"
     . "$here/env.sh" || exit 2
 }
 
-# Likewise, and what is in the folder tests can be imported, too.
+# Do the same, and make the modules in the folder tests importable.
 enter_tests() {
     enter "$@"
     export PYTHONPATH="$here/../tests:$here/../tests/shared${PYTHONPATH:+:$PYTHONPATH}"

@@ -49,7 +49,7 @@ BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `bench`; returns its exit code."""
+    """Run `bench`; return its exit code."""
     return run_command(lambda: _bench(sys.argv[1:] if arguments is None else arguments))
 
 

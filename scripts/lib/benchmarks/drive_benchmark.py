@@ -44,7 +44,7 @@ COUNTS_PER_CYCLE = (800, 209)
 
 
 class Driver:
-    """needle_device_driver's own cycle, without supervisor and ROS."""
+    """Client that runs the cycle of needle_device_driver, without supervisor and ROS."""
 
     def __init__(self, channel: str) -> None:
         values = DeviceDriverParameters()
@@ -68,7 +68,7 @@ class Driver:
         self._units = [values.axis(axis.name).counts_per_unit for axis in self._axes]
 
     def cycle(self, number: int) -> None:
-        """Run one cycle as the node does."""
+        """Run one cycle like the node."""
         for axis, start, counts, unit in zip(
             self._axes, self._starts, COUNTS_PER_CYCLE, self._units, strict=True
         ):
@@ -76,7 +76,7 @@ class Driver:
         self._run(self._cycle.exchange(PERIOD / 2))
 
     def close(self) -> None:
-        """Switch off."""
+        """Switch the drives off, and close the port."""
         for axis in self._axes:
             self._run(axis.close())
         self._port.close()
@@ -102,7 +102,7 @@ class Driver:
 
 
 class PlainSlcan:
-    """python-can's slcan bus, answers by its Notifier."""
+    """Client that uses python-can's slcan bus, with its Notifier for the answers."""
 
     def __init__(self, channel: str) -> None:
         self._bus = can.Bus(interface="slcan", channel=channel, bitrate=BITRATE, sleep_after_open=0)
@@ -124,7 +124,7 @@ class PlainSlcan:
             self._answers.acquire(timeout=PERIOD / 2)
 
     def close(self) -> None:
-        """Switch off."""
+        """Close the bus."""
         self._notifier.stop()
         self._bus.shutdown()
 
@@ -149,14 +149,14 @@ CLIENTS: dict[str, Callable[[str], Client]] = {
 
 
 def rows(cycles: int = CYCLES) -> Iterator[Row]:
-    """Yield delay and CPU share of the driver's 50 Hz cycle beside python-can's slcan."""
+    """Yield delay and CPU share of the driver's 50 Hz cycle, compared with python-can's slcan."""
     figures: dict[str, list[tuple[float, float]]] = {name: [] for name in CLIENTS}
     # The clients take turns, so that other load on the machine affects both.
     for _ in range(TURNS):
         for name, client in CLIENTS.items():
             delays, share = measure(client, cycles)
             figures[name].append((1e3 * float(np.percentile(delays, 99)), 100.0 * share))
-    # Minimum over the turns: the one that other load disturbed least.
+    # The minimum over the turns is the one least disturbed by other load.
     (_, driver), (against, reference) = (
         (name, np.min(values, axis=0).tolist()) for name, values in figures.items()
     )
@@ -173,7 +173,7 @@ def measure(make: Callable[[str], Client], cycles: int) -> tuple[list[float], fl
     delays : list of float
         Time from the set-points of a cycle to the SYNC at the drives [s].
     share : float
-        CPU share of this process, of one core.
+        CPU time of this process as a share of one core.
     """
     with tempfile.TemporaryDirectory(prefix="needle_bench_") as folder:
         channel = Path(folder) / "can"
@@ -197,13 +197,13 @@ def measure(make: Callable[[str], Client], cycles: int) -> tuple[list[float], fl
             share = (time.process_time() - worked) / (time.monotonic() - start)
             client.close()
             arrived = json.loads(drives.communicate("\n")[0])
-    # The first SYNC at or after the begin of a cycle belongs to it.
+    # The first SYNC at or after the start of a cycle belongs to it.
     after = np.searchsorted(arrived, begun)
     return [arrived[k] - at for k, at in zip(after, begun, strict=True) if k < len(arrived)], share
 
 
 def serve(channel: str) -> None:
-    """Run the drives until a line arrives on stdin, then print when each SYNC arrived."""
+    """Run the drives until a line arrives on stdin, then print the arrival time of each SYNC."""
     values = DriveEmulatorParameters(boot_time=0.0)
     now = time.monotonic()
     bus = EmulatedBus(map(values.cia402, AXES), now)
@@ -229,7 +229,7 @@ def serve(channel: str) -> None:
 
 
 def _map_pdos(write: Callable[[int, int, int, bytes], Any]) -> None:
-    """Map the PDOs as the driver does: controlword at once, target and position with SYNC."""
+    """Map the PDOs like the driver: controlword at once, target and position with SYNC."""
     maps: Sequence[tuple[int, int, int, Sequence[int], int]] = (
         (0x1400, 0x1600, 0x200, (0x60400010, 0x60600008), 255),
         (0x1401, 0x1601, 0x300, (0x607A0020,), 1),

@@ -1,4 +1,4 @@
-"""One row of `scripts/bench`: a figure beside its reference of the same run."""
+"""One row of `scripts/bench`: a figure and its reference from the same run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A figure and its reference, both in `unit`; `against` names the reference."""
+    """Figure and its reference, both in `unit`; `against` names the reference."""
 
     key: str
     what: str
@@ -18,5 +18,5 @@ class Row:
 
     @property
     def ratio(self) -> float:
-        """Ratio of the value to the reference."""
+        """Ratio of the reference to the value."""
         return self.reference / self.value

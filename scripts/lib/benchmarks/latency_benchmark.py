@@ -49,7 +49,7 @@ from needle_sim.sensors import TipSensor
 CALIBRATION = Path(needle_tracker.__file__).resolve().parents[1] / "config" / "calibration.yaml"
 FRAME = 1.0 / FRAME_RATE
 SPEED, DEPTH = 0.002, 0.030
-# Images count from this insertion: before, the tracker relies on the measured insertion [m].
+# Images count from this insertion on; before, the tracker relies on the measured insertion [m].
 FIRST = 0.006
 # Spacing of the drawn images along the insertion [m].
 _SPACING = 6e-5
@@ -58,7 +58,7 @@ STAGES = ("tracker", "controller", "driver", "image to set-point")
 _IMAGES_FILE, _INSERTIONS_FILE = "images.npy", "insertions.npy"
 # Jitter of the exposures, so that they do not synchronise with the driver's cycles [s].
 _JITTER = 0.01
-# Time from exposure to both images in the computer, as of a USB 3 camera [s].
+# Time from exposure to the arrival of both images in the computer, as with a USB 3 camera [s].
 _TRANSFER = 0.01
 _JOINT_SAMPLES = 100
 _PAIRS_BEFORE_START = 30
@@ -66,12 +66,12 @@ _TIMEOUT = 60.0
 
 
 def rows(depth: float = DEPTH) -> Iterator[Row]:
-    """Yield median and 99 % of the time of each stage, over an insertion to a depth [m].
+    """Yield median and 99th percentile of each stage's time, over an insertion to a depth [m].
 
     Raises
     ------
     UserError
-        If the graph does not get there.
+        If the needle does not reach the depth.
     """
     with tempfile.TemporaryDirectory(prefix="needle_bench_") as name:
         folder = Path(name)
@@ -90,7 +90,7 @@ def rows(depth: float = DEPTH) -> Iterator[Row]:
 
 
 class _DrawingSensor(TipSensor):
-    """Measures the tip, and draws the needle on its way."""
+    """Sensor that measures the tip, and draws the needle along its path."""
 
     def __init__(self, *parts: Any) -> None:
         super().__init__(*parts)
@@ -109,7 +109,7 @@ class _DrawingSensor(TipSensor):
 
 
 def draw(folder: Path, depth: float) -> None:
-    """Steer a needle in this process; save images of it on its way in a folder."""
+    """Steer a needle in this process, and save images along its path in a folder."""
     sensors: list[_DrawingSensor] = []
 
     def make_sensor(*parts: Any) -> _DrawingSensor:
@@ -127,7 +127,7 @@ def _run(folder: Path, depth: float) -> None:
     parameters: Parameters = {
         "recorder": {"bag": str(folder / "bag")},
         "drive_emulator": {"pty": adapter},
-        # Emulated drives are processes, which answer late on a busy machine.
+        # Emulated drives run in a process, which may answer late on a busy machine.
         "device_driver": {
             "channel": adapter,
             **dict.fromkeys(("watchdog", "reply_age_limit", "hold_timeout"), GRAPH_WATCHDOG),
@@ -174,9 +174,9 @@ class LatencyRig(RosRigClient):
     Parameters
     ----------
     folder : Path
-        With images, (N, 2, height, width), and the insertion of each pair, (N,) [m].
+        Folder with images, (N, 2, height, width), and the insertion of each pair, (N,) [m].
     calibration : Path
-        File of the cameras.
+        Calibration file of the cameras.
     """
 
     def __init__(self, folder: Path, calibration: Path) -> None:
@@ -205,7 +205,7 @@ class LatencyRig(RosRigClient):
         self._publish_pairs(_PAIRS_BEFORE_START)
         self.call_until_success(CONTROLLER_START)
         self.send_hold()
-        # The release precedes the press.
+        # A release must precede the press.
         self._publish_pairs(1)
         self.pressed = True
         self.until(lambda: self._joints[-1][1] >= depth, "the depth", _TIMEOUT)
@@ -217,12 +217,12 @@ class LatencyRig(RosRigClient):
         super().spin(min(timeout, max(self._due - time.monotonic(), 0.0)))
         if time.monotonic() >= self._due:
             self._publish_pair()
-            # A late camera does not catch up.
+            # A camera that is late does not catch up.
             self._due = max(self._due, time.monotonic() - FRAME)
             self._due += FRAME + self._random.uniform(-_JITTER, _JITTER)
 
     def _publish_pairs(self, count: int) -> None:
-        """Run until a number of further pairs is published."""
+        """Run until a number of further pairs has been published."""
         enough = self.published + count
         self.until(lambda: self.published >= enough, "images")
 
@@ -243,7 +243,7 @@ class LatencyRig(RosRigClient):
 
 
 def main() -> None:
-    """Run the cameras and the operator for an insertion as deep as the command line states."""
+    """Run the cameras and the operator for an insertion to the depth on the command line."""
     folder, calibration, depth = sys.argv[1:]
     rclpy.init()
     with closing(LatencyRig(Path(folder), Path(calibration))) as rig:

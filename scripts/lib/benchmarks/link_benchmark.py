@@ -1,4 +1,4 @@
-"""openigtlink's server beside pyigtl's: transforms to one client on loopback."""
+"""openigtlink's server compared with pyigtl's: transforms to one client on loopback."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def rows() -> Iterator[Row]:
 def _measured(
     port: int, size: int, is_connected: Callable[[], bool], send: Callable[[], object]
 ) -> list[float]:
-    """Return the median time per transform, alone and in a burst [ms]; it has `size` bytes."""
+    """Return the median time per transform of `size` bytes, alone and in a burst [ms]."""
     with socket.create_connection((_LOOPBACK, port)) as client:
         while not is_connected():
             time.sleep(0.001)

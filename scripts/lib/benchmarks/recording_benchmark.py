@@ -1,4 +1,4 @@
-"""The recorder beside rosbags' writer, the disk itself and the images sent."""
+"""The recorder compared with rosbags' writer, the disk alone and the images sent."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def writer_rows() -> Iterator[Row]:
 
     size = sum(len(data) for _, _, data in messages()) / 1e6
     ways = (_record, _write_rosbags, _write_plainly)
-    # The ways take turns, so that other load on the machine affects all.
+    # The writers take turns, so that other load on the machine affects all of them.
     seconds = [[_timed(way, messages) for way in ways] for _ in range(3)]
     recorder, rosbags, disk = (min(times) for times in zip(*seconds, strict=True))
     what = f"recorder's writer, {size:.0f} MB"

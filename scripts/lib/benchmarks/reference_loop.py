@@ -1,4 +1,4 @@
-"""The paper's loop for one needle in plain Python, a reference of `scripts/bench`.
+"""The paper's loop for one needle in plain Python, as a reference for `scripts/bench`.
 
 Plant [KC09] (1)-(2), observer (9) and law (10) with floats and the `math` module, and the same loop
 as systems of python-control.
@@ -37,7 +37,7 @@ def plant_start(x: float, pitch: float, roll: float) -> State:
 
 
 def plant_step(state: Sequence[float], design: Design, turn: float) -> State:
-    """Return the plant's state after a step: one screw motion."""
+    """Return the plant's state after a step, which is one screw motion."""
     length = design.step
     bend = design.curvature * length
     square = bend * bend + turn * turn
@@ -61,7 +61,7 @@ def plant_step(state: Sequence[float], design: Design, turn: float) -> State:
 
 
 def saturate(s: Linear, design: Design, margin: float) -> Linear:
-    """Return s within (6)'s region."""
+    """Return s, saturated to the region of (6)."""
     squared = s[1] ** 2 + (s[2] / design.curvature) ** 2
     if squared <= 1.0 - margin:
         return s
@@ -109,7 +109,7 @@ def law_turn(s: Linear, design: Design) -> float:
 
 
 def steer(start: Sequence[float], noise: Sequence[float], design: Design) -> float:
-    """Steer one needle, a step for each value of noise [m]; return its last x [m]."""
+    """Steer one needle with one step per noise value [m]; return its last x [m]."""
     plant = plant_start(*start)
     s = (plant[9] + noise[0], 0.0, 0.0)
     turn = law_turn(s, design)
@@ -123,8 +123,8 @@ def steer(start: Sequence[float], noise: Sequence[float], design: Design) -> flo
 def control_system(design: Design) -> Any:
     """Return the same loop as an interconnected system of python-control.
 
-    Input: noise of the measurement; output: x. States: twelve of the needle; s; the last turn; 1
-    after the first measurement.
+    The input is the measurement noise, the output x. The states are twelve of the needle, s, the
+    last turn, and 1 after the first measurement.
     """
     import control  # noqa: PLC0415  (it takes a second to import)
 

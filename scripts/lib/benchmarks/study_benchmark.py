@@ -1,4 +1,4 @@
-"""Speed and memory of studies and of the node's update, beside the reference loops."""
+"""Speed and memory of studies and of the node's update, compared with the reference loops."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def design() -> reference_loop.Design:
 
 
 def studies() -> Iterator[Row]:
-    """10,000 needles x 120 steps."""
+    """Yield the time of a study with 10,000 needles x 120 steps."""
     plain, with_control = _plain_study(), _control_study()
     for name, times in (("paper", 5), ("best", 1)):
         factory = controller_factory(name, TIP_NOISE)
@@ -71,7 +71,7 @@ def studies() -> Iterator[Row]:
 
 
 def updates() -> Iterator[Row]:
-    """One update of the node: estimate with covariance, command, reachability."""
+    """Yield the time of one update of the node: estimate with covariance, command, reachability."""
     d = design()
     s, errors = (-0.003, 0.0, 0.0), uniform_numbers(1, 1, 0, 0, UPDATES)[:, 0] * TIP_NOISE
     plain = _least_time(
@@ -94,7 +94,7 @@ def updates() -> Iterator[Row]:
 
 
 def memory() -> Iterator[Row]:
-    """Peak memory of a study, which must not grow with the steps."""
+    """Yield the peak memory of a study, which must not grow with the number of steps."""
     for name in ("paper", "best"):
         short, long = (_peak_memory(name, depth) for depth in (0.030, 0.120))
         what = f"{name}, memory of 1,000 x {STEPS}"
@@ -174,7 +174,7 @@ def _update_all(preset: str, taken: Sequence[tuple[FloatArray, JointSample]]) ->
 def _least_time(work: Callable[[], object], times: int) -> float:
     """Return the shortest CPU time of repeated work [s].
 
-    CPU time of one thread depends little on other load.
+    CPU time depends only slightly on other load.
     """
     seconds = []
     for _ in range(times):

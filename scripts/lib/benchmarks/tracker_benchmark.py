@@ -1,4 +1,4 @@
-"""Speed and error of the tracker beside plain OpenCV, on the same rendered pairs."""
+"""Speed and error of the tracker compared with plain OpenCV, on the same rendered pairs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PlainTracker:
     Parameters
     ----------
     calibration : StereoCalibration
-        The rig.
+        Calibration of the rig.
     empty : pair of ndarray of uint8
         Images without a needle.
     """
@@ -48,7 +48,7 @@ class PlainTracker:
         self._entries = [(p @ [0.0, 0.0, 0.0, 1.0]) for p in self._projections]
 
     def tip(self, pair: tuple[Image, Image], corrected: bool) -> Array:
-        """Return the tip in `rig` [m], NaN where nothing is found."""
+        """Return the tip in `rig` [m]; NaN if no tip is found."""
         points = []
         for i, image in enumerate(pair):
             changed = cv2.absdiff(self._undistorted(self._cameras[i], image), self._empty[i])
@@ -64,7 +64,7 @@ class PlainTracker:
         found = cv2.triangulatePoints(*self._projections, *points).reshape(4)
         tip = np.asarray(found[:3] / found[3], dtype=np.float64)
         if corrected:
-            # Refraction makes the apparent depth the true one divided by the refractive index.
+            # By refraction, the apparent depth is the true one divided by the refractive index.
             surface = self._window.point[0]
             tip[0] = surface - (surface - tip[0]) * self._window.inside
         return tip

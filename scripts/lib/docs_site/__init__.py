@@ -1,1 +1,1 @@
-"""The documents as a site: this checkout's own pages, with a reference written from the code."""
+"""Documentation site: the checkout's pages, and a reference generated from the code."""

@@ -1,4 +1,4 @@
-"""Pages of the libraries, written by autodoc from the docstrings."""
+"""Pages of the libraries, generated from the docstrings by autodoc."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ ROOMS = (
     "needle_sim.needle",
     "needle_sim.studies",
 )
-"""Packages for own estimators, laws, planners, studies and programs that read bags."""
+"""Packages for user-written estimators, laws, planners, studies and programs that read bags."""
 
 
 def api_pages() -> dict[str, str]:
-    """Return every page by its file name: an index, and one page for each package."""
+    """Return an index and one page for each package, by file name."""
     rows = []
     found = {}
     for room in ROOMS:

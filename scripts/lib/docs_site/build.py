@@ -37,8 +37,8 @@ _INDEX = f"""\
 
 
 def build(out: Path) -> bool:
-    """Write the site into a folder; returns False where Sphinx warned of anything, on stderr."""
-    # These take seconds to import: not for a command line that is refused.
+    """Write the site into a folder; return False if Sphinx printed warnings."""
+    # Import late, because this takes seconds and the command line may be invalid.
     from sphinx.cmd.build import main as sphinx  # noqa: PLC0415
 
     from docs_site.api_pages import api_pages  # noqa: PLC0415
@@ -57,7 +57,7 @@ def build(out: Path) -> bool:
 
 
 def main() -> int:
-    """Run `docs`; returns its exit code."""
+    """Run `docs`; return its exit code."""
     return run_command(_docs)
 
 

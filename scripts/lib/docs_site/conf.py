@@ -13,7 +13,7 @@ from sphinx.application import Sphinx
 project = "Needle steering"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "README"
-# Blocks without a language are commands and tables of text.
+# Blocks without a language are commands and plain-text tables.
 highlight_language = "none"
 
 myst_enable_extensions = ["dollarmath"]
@@ -26,7 +26,7 @@ napoleon_use_ivar = True
 # In a docstring, `x` is a name or a value.
 default_role = "py:obj"
 
-# List pages in the navigation, not their functions, which every page would repeat.
+# List only pages in the navigation, because every page would repeat the functions.
 toc_object_entries = False
 
 html_theme = "furo"
@@ -42,7 +42,7 @@ _FULL_NAME = re.compile(r"needle_\w+(\.\w+)+")
 
 
 def _escape(app: Sphinx, what: str, *described: Any) -> None:
-    """Escape `|x|`, an absolute value, which is a substitution in reStructuredText."""
+    """Escape absolute values `|x|`, which reStructuredText would treat as substitutions."""
     lines: list[str] = described[-1]
     lines[:] = [line.replace("|", "\\|") for line in lines]
     if what in ("attribute", "data"):

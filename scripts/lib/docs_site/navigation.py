@@ -1,4 +1,4 @@
-"""The site's navigation: sections and order of docs/README.md."""
+"""Navigation of the site, with the sections and order of docs/README.md."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PAGE = re.compile(r"\[([^\]]+)\]\((?![a-z]+:)([^)#]+\.md)\)")
 
 
 def navigation(overview: str) -> str:
-    """Return a hidden table of contents for each section, for the end of the front page.
+    """Return a hidden table of contents for each section, to append to the front page.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def navigation(overview: str) -> str:
 
 
 def toctree(entries: Iterable[str], caption: str = "") -> str:
-    """Return a hidden table of contents; an empty text without entries."""
+    """Return a hidden table of contents; empty if there are no entries."""
     lines = [entry.replace(".md", "") for entry in entries]
     if not lines:
         return ""
@@ -43,7 +43,7 @@ def toctree(entries: Iterable[str], caption: str = "") -> str:
 
 
 def parts(generated: Iterable[str]) -> dict[str, list[str]]:
-    """Return pages with their parts: `x/y.md` is one of `x.md`."""
+    """Return the parts of each page; `x/y.md` is a part of `x.md`."""
     found: dict[str, list[str]] = {name: [] for name in generated if "/" not in name}
     for name in generated:
         whole, slash, _ = name.partition("/")
@@ -53,5 +53,5 @@ def parts(generated: Iterable[str]) -> dict[str, list[str]]:
 
 
 def listed(titles: Mapping[str, str]) -> str:
-    """Return links to generated pages, one a line, as docs/README.md has them."""
+    """Return links to generated pages, one per line, in the form of docs/README.md."""
     return "\n".join(f"- [{title}](reference/{name})" for name, title in titles.items())

@@ -1,4 +1,4 @@
-"""Copies the pages of the checkout to the source folder of Sphinx, under the same paths."""
+"""Copy of the checkout's pages in the source folder of Sphinx, under the same paths."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from reference.markdown import block
 
 PAGES = ("*.md", "bags/*.md", "docs/**/*.md", "ros2_ws/src/*/README.md")
 REFERENCE = "docs/reference"
-"""Where the generated pages go."""
+"""Folder of the generated pages."""
 LISTING = "files.md"
-"""Page with all files of a folder, target of a link to the folder."""
+"""Page with all files of a folder, to which links to the folder lead."""
 _LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
 _NOT_LISTED = ("build", "__pycache__")
 
 
 def pages() -> list[Path]:
-    """Return the pages that the checkout has, relative to it."""
+    """Return the paths of the checkout's pages, relative to it."""
     return sorted({path.relative_to(ROOT) for form in PAGES for path in ROOT.glob(form)})
 
 
@@ -31,7 +31,7 @@ def write_tree(folder: Path, generated: dict[str, str]) -> None:
     Parameters
     ----------
     folder : Path
-        Empty folder.
+        An empty folder.
     generated : dict of str to str
         Pages of the reference by their path below `REFERENCE`; `x/y.md` is a part of `x.md`.
     """
@@ -52,7 +52,7 @@ def write_tree(folder: Path, generated: dict[str, str]) -> None:
 
 
 def _copy_target(page: Path, target: str, text: str, folder: Path) -> str:
-    """Copy the target of a link; return the text, with a link to a folder replaced by its page."""
+    """Copy the target of a link; return the text, with links to a folder replaced by its page."""
     there = (ROOT / page.parent / target).resolve()
     if there.suffix == ".md" or not there.is_relative_to(ROOT):
         return text

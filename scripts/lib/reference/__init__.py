@@ -1,1 +1,1 @@
-"""The reference of the documents' site: written from the nodes and commands as they are."""
+"""Reference pages of the documentation site, generated from the nodes and commands."""

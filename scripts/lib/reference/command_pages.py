@@ -1,4 +1,4 @@
-"""The page of command lines: `--help` of every command and script."""
+"""Page of command lines: `--help` of every command and script."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def help_of_script(name: str) -> str:
         with path, mock.patch.dict(sys.modules, extras):
             text = help_of_module(file[1].rpartition("/")[2], name)
             imported = dict(sys.modules)
-        # patch.dict removes all new modules; only those with the replaced extras must go.
+        # patch.dict removes all new modules; restore those that do not use the replaced extras.
         for key, value in imported.items():
             if key not in extras and not str(getattr(value, "__file__", "")).startswith(folder):
                 sys.modules.setdefault(key, value)
@@ -66,7 +66,7 @@ def help_of_script(name: str) -> str:
 
 
 def commands_page(nodes: Sequence[RigNode]) -> str:
-    """Return the page."""
+    """Return the page of command lines."""
     links = ", ".join(node_link(node.name) for node in nodes)
     page = [
         "# Command lines\n\nExit codes are the same for all "
@@ -78,6 +78,6 @@ def commands_page(nodes: Sequence[RigNode]) -> str:
     for package, name, module in executables("command"):
         page.append(f"### {name}\n\n    ros2 run {package} {name}\n\n")
         page.append(block(help_of_module(module, name)))
-    # The player has its own options beside its parameters.
+    # The player has its own options in addition to its parameters.
     page.append(f"### player\n\n{block(help_of_module('needle_bags.ros.player', 'player'))}")
     return "".join(page)

@@ -1,4 +1,4 @@
-"""The page of diagnostics: parts and keys of each node, and the texts of warnings and errors."""
+"""Page of diagnostics: parts and keys of each node, and the texts of warnings and errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FILLED_IN = "..."
 
 @dataclasses.dataclass(frozen=True)
 class DiagnosticText:
-    """A warning or error text in the code.
+    """Warning or error text in the code.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class DiagnosticText:
     level : str
         WARN or ERROR.
     text : str
-        The text; `...` stands for values, or for text of another module.
+        The text; `...` stands for values, or for text from another module.
     """
 
     package: str
@@ -88,7 +88,7 @@ def _text(words: ast.expr | None) -> str:
 
 
 def diagnostics_page(nodes: Sequence[RigNode]) -> str:
-    """Return the page."""
+    """Return the page of diagnostics."""
     parts = [
         (node_link(node.name), code(part), ", ".join(map(code, keys)))
         for node in nodes

@@ -12,26 +12,26 @@ from code_lines import ROOT
 
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 NAMESPACE = "/of_the_reference"
-"""Namespace of the constructed nodes: other names are absolute."""
+"""Namespace of the constructed nodes; names outside it are absolute."""
 SOURCES = ROOT / "ros2_ws" / "src"
-# Packages of the types of rclpy's own endpoints.
+# Packages with the types of rclpy's own endpoints.
 _RCLPY = ("rcl_interfaces", "type_description_interfaces")
 
 
 @dataclasses.dataclass(frozen=True)
 class Endpoint:
-    """One end of a topic or service.
+    """Publisher, subscriber, server or client of a topic or service.
 
     Attributes
     ----------
     role : str
         PUBLISHES, SUBSCRIBES, SERVES or CALLS.
     name : str
-        Name without a namespace, relative unless it is absolute.
+        Name relative to the node's namespace, or absolute.
     type_name : str
         `package/Type`.
     qos : str
-        In words; empty for a service.
+        Quality of service in words; empty for a service.
     """
 
     role: str
@@ -41,7 +41,7 @@ class Endpoint:
 
 
 def endpoints_of(node: Node) -> list[Endpoint]:
-    """Return the endpoints of a node, each once, without those of every ROS node."""
+    """Return the distinct endpoints of a node, without those that every ROS node has."""
     found: list[tuple[str, str, type[Any], str]] = [
         *((PUBLISHES, p.topic_name, p.msg_type, in_words(p.qos_profile)) for p in node.publishers),
         *(
@@ -60,7 +60,7 @@ def endpoints_of(node: Node) -> list[Endpoint]:
 
 
 def type_name(kind: type) -> str:
-    """Return `package/Type` of a class of messages or services."""
+    """Return `package/Type` of a message or service class."""
     return f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
 
 

@@ -1,4 +1,4 @@
-"""Markdown: cells, tables, links."""
+"""Markdown cells, tables and links."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 NODES = "nodes/"
-"""Folder of the nodes' pages, beside the other pages."""
+"""Folder of the nodes' pages, in the folder of the other pages."""
 
 
 def cell(text: str) -> str:
@@ -15,12 +15,12 @@ def cell(text: str) -> str:
 
 
 def code(text: str) -> str:
-    """Return text as inline code, backticks included."""
+    """Return text, which may contain backticks, as inline code."""
     return f"`` {text} ``" if "`" in text else f"`{text}`"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table and an empty line, without empty columns; an empty text without rows."""
+    """Return a table and an empty line, without empty columns; empty if there are no rows."""
     rows = list(rows)
     used = [k for k in range(len(head)) if any(row[k] for row in rows)]
     lines = [f"| {' | '.join(cell(row[k]) for k in used)} |" for row in rows]

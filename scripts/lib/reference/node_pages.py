@@ -1,4 +1,4 @@
-"""Pages of the nodes: topics, services, parameters and diagnostics of each."""
+"""Pages of the nodes, with the topics, services, parameters and diagnostics of each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OPEN_TOPICS = {
 }
 """Notes on topics that depend on the graph or a bag, by node."""
 OPEN_SERVICES = {"recorder": "`recorder` asks every node for its parameters.\n\n"}
-"""Likewise, on services."""
+"""Notes on services that depend on the graph, by node."""
 _EVERY_NODE = """\
 Every node also publishes `/diagnostics` and `/rosout`, and has ROS's own services and
 `/parameter_events` for parameters.

@@ -1,4 +1,4 @@
-"""Constructs every node of the rig in each variant that has other topics or services."""
+"""Construction of every node of the rig, in each variant with different topics or services."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ IN_EVERY_NODE = {
     "handlers": "a handler failed; counted",
     "duplicates": "another node publishes on a topic of this node",
 }
-"""Parts of diagnostics that any node may report, by `needle_core.ros`."""
+"""Diagnostic parts that any node may report, through `needle_core.ros`."""
 _WEB_SERVER = "needle_console.page.web_server"
 
 
@@ -55,7 +55,7 @@ def executables(kind: str) -> Iterator[tuple[str, str, str]]:
 
 @dataclasses.dataclass(frozen=True)
 class RigNode:
-    """A node of the rig.
+    """Node of the rig.
 
     Attributes
     ----------
@@ -66,9 +66,9 @@ class RigNode:
     parameters : type
         Dataclass of its parameters.
     variants : dict of str to list of Endpoint
-        Endpoints by the description of the variant.
+        Endpoints by description of the variant.
     parts : dict of str to list of str
-        Parts of its diagnostics, with the keys of the values of each.
+        Parts of its diagnostics, with the keys of each part's values.
     """
 
     name: str
@@ -79,7 +79,7 @@ class RigNode:
     parts: dict[str, list[str]]
 
     def endpoints(self, *roles: str) -> list[tuple[Endpoint, str]]:
-        """Return each endpoint with the variants that have it; an empty text for all."""
+        """Return each endpoint with the variants that have it; empty text if all do."""
         found: dict[Endpoint, list[str]] = {}
         for when, ends in self.variants.items():
             for end in ends:
@@ -93,7 +93,7 @@ class RigNode:
 
     @property
     def help(self) -> str:
-        """Its text of `--help`, without the parameters."""
+        """Text of the node's `--help`, without the parameters."""
         return str(getattr(self.module, "HELP", "")).strip("\n")
 
 
@@ -130,7 +130,7 @@ def _construct(
     with (
         tempfile.TemporaryDirectory() as scratch,
         _replaced_web_server(),
-        # No camera is connected.
+        # Avoid opening a camera.
         mock.patch("needle_tracker.stereo_camera.open_source"),
         mock.patch.object(DiagnosticsPublisher, "set", report_and_note),
     ):
@@ -153,8 +153,8 @@ def _construct(
 
 @contextlib.contextmanager
 def _replaced_web_server() -> Iterator[None]:
-    """Replace the console's page, which needs NiceGUI."""
-    # mock.patch.dict would remove all modules that are imported meanwhile.
+    """Replace the console's page, which requires NiceGUI."""
+    # mock.patch.dict would remove all modules that are imported in the meantime.
     before = sys.modules.pop(_WEB_SERVER, None)
     sys.modules[_WEB_SERVER] = mock.Mock(ServedPagePort=PagePort)
     yield
@@ -164,12 +164,12 @@ def _replaced_web_server() -> Iterator[None]:
 
 
 def _made_by_main(module: ModuleType, arguments: list[str]) -> Any:
-    """Return the call of `run_node` by the `main` of a node's module."""
+    """Return the call of `run_node` that the `main` of a node's module makes."""
     with (
         mock.patch.object(main, "run_node", return_value=0) as run,
         mock.patch.object(module, "run_node", run, create=True),
         mock.patch.object(sys, "argv", [module.__name__, *arguments]),
-        # Topics and services do not depend on optional packages.
+        # Treat optional packages as installed, because the page must not depend on them.
         mock.patch("importlib.util.find_spec"),
     ):
         module.main()
@@ -208,14 +208,14 @@ def _exercise_console(node: Any) -> None:
 
 
 def _exercise_player(node: Any) -> None:
-    """Let it publish the time, and no topic of its bag."""
+    """Publish the time, but no topic of the bag."""
     node._topics.clear()
     node._make_publishers()
     node.check_graph()
 
 
 def _exercise_recorder(node: Any) -> None:
-    """Let it report, and subscribe to no topic of the graph."""
+    """Publish a report, and unsubscribe from all topics of the graph."""
     node.report()
     node.recording.close()
     node._topics.unsubscribe()

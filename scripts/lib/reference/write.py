@@ -13,7 +13,7 @@ from reference.rig_nodes import rig_nodes
 
 
 def pages() -> dict[str, str]:
-    """Return every page by its file's name."""
+    """Return every page by file name."""
     nodes = rig_nodes()
     return {
         "nodes.md": nodes_index(nodes),

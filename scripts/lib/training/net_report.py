@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 
 WIDTHS_PX = (2.2, 4.0, 6.0, 9.0)
 """Bounds of the classes of needle widths [px]."""
-_NEAR_PX = 4  # largest error of a detected end
+_NEAR_PX = 4  # maximum error of a detected end
 _AROUND_PX = 8  # radius of one peak
-_SEEN = 0.5  # expected ends of a peak that is a detection
+_SEEN = 0.5  # expected number of ends from which a peak counts as a detection
 _SHAFT_PX = 15.0  # length of shaft that determines its direction
 _AT_ONCE = 16  # samples in a batch
 
@@ -37,9 +37,9 @@ class EndError:
     Attributes
     ----------
     along, across : float
-        Along and across the shaft [px].
+        Error along and across the shaft [px].
     sigmas : float
-        Mahalanobis distance by the spread of the peak.
+        Mahalanobis distance with respect to the spread of the peak.
     """
 
     along: float
@@ -49,7 +49,7 @@ class EndError:
 
 @dataclasses.dataclass
 class Figures:
-    """Figures of all samples of one class."""
+    """Figures over all samples of one class."""
 
     samples: int = 0
     entropy: float = 0.0
@@ -103,7 +103,7 @@ def end_error(intensity: Array, share: Array, end: Array) -> EndError | None:
     intensity : ndarray, shape (height, width)
         Intensity of ends [1/px^2].
     share : ndarray, shape (height, width)
-        Share of shaft in each pixel.
+        Share of the shaft in each pixel.
     end : ndarray, shape (2,)
         True end, column and row [px].
     """
@@ -125,7 +125,7 @@ def end_error(intensity: Array, share: Array, end: Array) -> EndError | None:
 
 
 def report(net: NeedleNet, shards: Iterable[Shard]) -> str:
-    """Return a table of the figures of a net, by width and with or without a background."""
+    """Return a table of the figures of a net, by needle width and presence of a background."""
     stored = StoredNet(net).eval()
     table: dict[tuple[int, bool], Figures] = {}
     for shard in shards:
@@ -150,7 +150,7 @@ def report(net: NeedleNet, shards: Iterable[Shard]) -> str:
 
 
 def _count(figures: Figures, shaft: Array, log_intensity: Array, share: Array, end: Array) -> None:
-    """Add one sample."""
+    """Add one sample to the figures."""
     chance = np.clip(shaft, 1e-6, 1.0 - 1e-6)
     intensity = np.exp(log_intensity)
     figures.samples += 1
@@ -170,7 +170,7 @@ def _count(figures: Figures, shaft: Array, log_intensity: Array, share: Array, e
 
 
 def report_views(net: NeedleNet, scenes: Iterable[TracedScene]) -> str:
-    """Return a table of the ends in whole images, without and with the empty phantom.
+    """Return a table of the ends detected in whole images, without and with a background.
 
     Parameters
     ----------

@@ -20,32 +20,32 @@ from needle_tracker.tracker_parameters import StereoTrackerParameters
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_LEAST_TIPS = 10  # for the fit of the path
-_MOST_PAIRS = 60  # of each recording, to limit memory
-_EVERY = 5  # one in so many pairs is held out
-_HOLE_SIGMA, _TIP_SIGMA = 0.3e-3, 0.2e-3  # of the path at the entry and of a tip about it [m]
+_LEAST_TIPS = 10  # minimum number of tips for the fit of the path
+_MOST_PAIRS = 60  # maximum number of pairs per scene, to limit memory
+_EVERY = 5  # one pair in this many is held out
+_HOLE_SIGMA, _TIP_SIGMA = 0.3e-3, 0.2e-3  # sigma of the path at the entry, and of a tip [m]
 _PASSES, _POINTS = 5, 60  # iterations of the fit; points of a drawn shaft
-_SHORT = 10e-3  # length of the needle that gives the width in images without one [m]
+_SHORT = 10e-3  # assumed needle length to compute the width in images without a needle [m]
 
 
 def own_scenes(folder: Path, width: float) -> tuple[TracedScene, TracedScene]:
     """Return the training scene and the held-out scene of a recording.
 
-    The needle follows its tip, so the path of the believed tips gives the shaft in each image, also
-    in the pairs between them without a tip.
+    The needle follows its tip, so the path of the accepted tips gives the shaft in each image,
+    including those between them without a tip.
 
     Parameters
     ----------
     folder : Path
-        calibration.yaml; empty/left and empty/right, images of an insertion without a needle;
-        needle/left, needle/right and needle/insertion.csv, the same with one.
+        Folder with calibration.yaml; empty/left and empty/right, images of an insertion without a
+        needle; needle/left, needle/right and needle/insertion.csv, the same with a needle.
     width : float
         Diameter of the needle [m].
 
     Raises
     ------
     UserError
-        A missing file, or too few believed tips.
+        If a file is missing, or too few tips were accepted.
     """
     calibration = load_calibration(folder / "calibration.yaml")
     parameters = StereoTrackerParameters(needle_width=width)
@@ -86,14 +86,14 @@ class OwnPair:
 
 
 class TipPath:
-    """Path of the tip: a cubic of the insertion, through the entry.
+    """Path of the tip as a cubic function of the insertion, through the entry.
 
     Parameters
     ----------
     insertions : ndarray, shape (n,)
         Insertions of the tips [m].
     tips : ndarray, shape (n, 3)
-        In `rig` [m].
+        Positions of the tips in `rig` [m].
     """
 
     def __init__(self, insertions: Array, tips: Array) -> None:
@@ -102,7 +102,7 @@ class TipPath:
         terms, points = self._terms(s), np.vstack([tips, np.zeros(3)])
         sigmas = np.append(np.full(len(tips), _TIP_SIGMA), _HOLE_SIGMA)
         weights = 1.0 / sigmas
-        # Reweighted least squares: outliers have a low weight.
+        # Iteratively reweighted least squares give outliers a low weight.
         for _ in range(_PASSES):
             rows = weights[:, None]
             self._cubic, *_ = np.linalg.lstsq(terms * rows, points * rows, rcond=None)
@@ -120,7 +120,7 @@ class TipPath:
 def _scene(
     rig: StereoRig, width: float, path: TipPath, empty: OwnPair, pairs: list[OwnPair]
 ) -> TracedScene:
-    """Return a scene of pairs, the first without a needle."""
+    """Return a scene of image pairs, of which the first has no needle."""
     step = -(-len(pairs) // _MOST_PAIRS)
     images, shares, ends, widths = [], [], [], []
     for pair in [empty, *pairs[::step]]:
@@ -142,7 +142,7 @@ def _pairs(folder: Path, insertions: Mapping[str, float]) -> list[OwnPair]:
     Raises
     ------
     UserError
-        No pair is readable.
+        If no pair is readable.
     """
     found = []
     for pair in open_pairs(folder / "left", folder / "right"):

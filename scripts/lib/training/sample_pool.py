@@ -1,4 +1,4 @@
-"""Samples in files: a process that writes them, and the pool from which the training draws."""
+"""Samples in files: functions that write them, and the pool from which the training draws."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ Float = NDArray[np.float32]
 SHARD = 128
 """Number of samples in a file."""
 CONTEXT = 8
-"""Margin around a patch that the net sees [px], so that fewer pixels are at a border."""
+"""Margin around a patch in the net's input [px], so that fewer pixels are at a border."""
 KINDS = ("drawn", "traced")
 _TRACED_SHARE = 0.6  # share of path-traced samples in a batch
 _OUTSIDE = BORDER - CONTEXT
 HELD_OUT = 9
-"""Scenes whose number ends with this digit are for validation only."""
-_AT_ONCE = 12  # scenes for the samples of one file
+"""Last digit of the numbers of scenes that are for validation only."""
+_AT_ONCE = 12  # number of scenes for the samples of one file
 _TRACED_PER_DRAWN = 2
-_VALIDATION = 6  # files of each kind
+_VALIDATION = 6  # number of validation files of each kind
 _SEED_OF, _UNSEEN = {"drawn": 0, "traced": 1}, 10
 _POLL = 5.0  # [s]
 
@@ -59,9 +59,9 @@ class Batch:
     seen : ndarray of float32, shape (n, 2, SIZE + 2 CONTEXT, SIZE + 2 CONTEXT)
         Images and backgrounds, normalized.
     shares : ndarray of float32, shape (n, SIZE, SIZE)
-        Share of shaft in each pixel, 0 to 1.
+        Share of the shaft in each pixel, 0 to 1.
     ends : ndarray of float32, shape (n, 2)
-        Column and row of the end in each patch [px]; NaN without an end.
+        Column and row of the end in each patch [px]; NaN if there is none.
     widths_px : ndarray, shape (n,)
         Widths of the needles [px].
     known : ndarray of bool, shape (n,)
@@ -112,31 +112,31 @@ def read_shard(path: Path) -> Shard:
 
 
 class Pool:
-    """All samples of a folder: files `drawn-*.npz` and `traced-*.npz`."""
+    """All samples in the files `drawn-*.npz` and `traced-*.npz` of a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._shards: dict[str, dict[str, Shard]] = {kind: {} for kind in KINDS}
 
     def update(self) -> int:
-        """Read new files, drop deleted ones; return the number of samples."""
+        """Read new files and drop deleted ones; return the number of samples."""
         for kind, shards in self._shards.items():
             there = {path.name: path for path in self._folder.glob(f"{kind}-*.npz")}
             for name in shards.keys() - there.keys():
                 del shards[name]
             for name in sorted(there.keys() - shards.keys()):
-                # The other process may delete the file meanwhile.
+                # The other process may delete the file in the meantime.
                 with contextlib.suppress(FileNotFoundError):
                     shards[name] = read_shard(there[name])
         return SHARD * sum(len(shards) for shards in self._shards.values())
 
     def batch(self, rng: np.random.Generator, count: int) -> Batch:
-        """Return samples of both kinds, rotated and mirrored at random.
+        """Return random samples of both kinds, randomly rotated and mirrored.
 
         Parameters
         ----------
         rng : Generator
-            Generator of the choices.
+            Random generator.
         count : int
             Number of samples.
         """
@@ -151,7 +151,7 @@ class Pool:
 
 
 def batch_of(chosen: list[tuple[Shard, int]], turns: list[int], mirrors: list[bool]) -> Batch:
-    """Return chosen samples as a batch.
+    """Return selected samples as a batch.
 
     Parameters
     ----------
@@ -216,14 +216,14 @@ def write_scene(path: Path, scene: TracedScene) -> None:
 
 
 def scene_paths(folder: Path, held_out: bool) -> list[Path]:
-    """Return the files of the scenes in a folder, by their number."""
+    """Return the files of the scenes in a folder, sorted by number."""
     paths = [path for path in folder.glob("*.npz") if path.stem.isdigit()]
     paths = [path for path in paths if is_held_out(int(path.stem)) == held_out]
     return sorted(paths, key=lambda path: int(path.stem))
 
 
 def supply(scenes: Path, folder: Path, most: dict[str, int]) -> None:
-    """Write files of samples without end: above the limit, a new file replaces the oldest.
+    """Write files of samples forever; above the limit, a new traced file replaces the oldest.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def supply(scenes: Path, folder: Path, most: dict[str, int]) -> None:
     folder : Path
         Output folder.
     most : dict of str to int
-        Largest number of files of each kind; drawing stops there.
+        Maximum number of files of each kind; drawing stops there.
     """
     cv2.setNumThreads(1)
     folder.mkdir(parents=True, exist_ok=True)

@@ -73,7 +73,7 @@ quality. Scenes whose number ends in 9 are held out for the report.
 
 
 def rig_of(seed: int) -> StereoRig:
-    """Return the cameras of a scene by its seed."""
+    """Return the cameras of a scene, given its seed."""
     if seed % 2 == 0:
         return load_stereo_rig(CALIBRATIONS[seed // 2 % 2])
     with tempfile.TemporaryDirectory() as folder:
@@ -83,7 +83,7 @@ def rig_of(seed: int) -> StereoRig:
 
 
 def trace_all(count: int, folder: Path) -> None:
-    """Trace the missing scenes, in turn on the bench and in a box.
+    """Trace the missing scenes, alternately on the bench and in a box.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def read_arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """Trace, draw, train, report; returns the exit code."""
+    """Trace, draw, train and report; return the exit code."""
     given = read_arguments()
     checkpoint = given.folder / "checkpoint.pt"
     scenes, samples = given.folder / "scenes", given.folder / "samples"

@@ -1,4 +1,4 @@
-"""Training loop: losses, schedule, checkpoints."""
+"""Training loop with losses, schedule and checkpoints."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from training_net import (
 )
 
 _BATCH, _DECAY = 16, 1e-4
-_RATE, _TUNING_RATE = 3e-3, 3e-4  # largest learning rate of a new net and of a trained one
-_WARM_UP, _FIRST_RATE, _LAST_RATE = 0.08, 0.04, 0.002  # share of the run, and of the rate
-_END_WEIGHT = 0.04  # of the loss of ends relative to the loss of shaft
-_LARGEST_STEP = 2.0  # norm of the gradients
+_RATE, _TUNING_RATE = 3e-3, 3e-4  # maximum learning rate of a new net and of a trained one
+_WARM_UP, _FIRST_RATE, _LAST_RATE = 0.08, 0.04, 0.002  # share of the run; shares of the rate
+_END_WEIGHT = 0.04  # weight of the loss of ends relative to the loss of the shaft
+_LARGEST_STEP = 2.0  # maximum norm of the gradients
 _WORST, _MOST_BAD = (1.0, 30.0), 20  # losses above which a batch is skipped; consecutive skips
-_FULL_PRECISION = 0.9  # progress from which on a run does not round
-_MEAN_OVER = 1000  # steps over which the weights are averaged
+_FULL_PRECISION = 0.9  # progress after which bfloat16 is not used
+_MEAN_OVER = 1000  # number of steps over which the weights are averaged
 _LOOK_EVERY = 200  # steps between updates of the pool
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Length and files of a training.
+    """Length and files of a training run.
 
     Attributes
     ----------
     steps : int
-        Steps of the whole run.
+        Number of steps of the whole run.
     minutes : float
-        Longest duration [min]; the learning rate falls accordingly.
+        Maximum duration [min]; the learning rate decays accordingly.
     output, checkpoint : Path
         Files of the net and of the checkpoint.
     every : float
@@ -70,11 +70,11 @@ class Run:
     rng : Generator
         Generator for the choice of samples.
     rate : float
-        Largest learning rate.
+        Maximum learning rate.
     step : int
-        Steps done.
+        Number of completed steps.
     seconds : float
-        Duration of the steps [s].
+        Total duration of the steps [s].
     """
 
     net: NeedleNet
@@ -113,7 +113,7 @@ def new_run(seed: int, weights: Path | None = None) -> Run:
     seed : int
         Seed of the initial weights.
     weights : Path or None
-        Initial weights, from `export`; None: an untrained net.
+        Initial weights, from `export`; None for an untrained net.
     """
     torch.manual_seed(seed)
     if weights is None:
@@ -144,7 +144,7 @@ def _run(net: NeedleNet, rate: float) -> Run:
 
 
 def rate_share(progress: float) -> float:
-    """Return the share of the largest rate: a linear rise, then a cosine."""
+    """Return the share of the maximum rate, which rises linearly, then falls as a cosine."""
     if progress < _WARM_UP:
         return _FIRST_RATE + (1.0 - _FIRST_RATE) * progress / _WARM_UP
     left = 0.5 * (1.0 + np.cos(np.pi * min((progress - _WARM_UP) / (1.0 - _WARM_UP), 1.0)))
@@ -152,26 +152,26 @@ def rate_share(progress: float) -> float:
 
 
 def shaft_loss(logits: torch.Tensor, shares: torch.Tensor) -> torch.Tensor:
-    """Return the mean loss of the shaft probability, with a larger weight for needle pixels."""
+    """Return the mean loss of the shaft probability, with a higher weight for needle pixels."""
     losses = functional.binary_cross_entropy_with_logits(logits, shares, reduction="none")
     return (losses * (1.0 + NEEDLE_WEIGHT * shares)).mean()
 
 
 def end_loss(log_intensity: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
-    """Return the mean over patches of minus the log-likelihood of their ends.
+    """Return the negative log-likelihood of the ends, averaged over patches.
 
     Ends are a Poisson process of intensity lambda: -log L = sum(lambda) - sum_ends log(lambda).
-    Likelihood is a proper score: the net learns peaks whose spread is their error, and whose sum is
-    the probability of an end.
+    Likelihood is a proper score, so the net learns peaks whose spread is their error and whose sum
+    is the probability of an end.
 
     Parameters
     ----------
     log_intensity : Tensor, shape (n, height, width)
         log(lambda) [1/px^2].
     ends : Tensor, shape (n, 2)
-        Column and row of the end in each patch [px]; NaN without an end.
+        Column and row of the end in each patch [px]; NaN if there is none.
     """
-    # Keep the gradient of clamped values, so that they can return.
+    # Keep the gradient of clamped values, so that they can return to the range.
     cut = log_intensity + (log_intensity.clamp(*LOG_INTENSITY) - log_intensity).detach()
     intensity = torch.exp(cut)
     total = intensity.sum()
@@ -191,7 +191,7 @@ def end_loss(log_intensity: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
 
 
 def losses(net: NeedleNet, batch: Batch, *, rounded: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the losses of shaft and ends; rounded: with bfloat16, which may be faster."""
+    """Return the losses of shaft and ends, if `rounded` with bfloat16, which may be faster."""
     seen = torch.from_numpy(batch.seen).to(memory_format=torch.channels_last)
     with torch.autocast("cpu", torch.bfloat16, enabled=rounded):
         out = net(seen)
@@ -218,14 +218,14 @@ def train(run: Run, pool: Pool, plan: Plan) -> None:
     pool : Pool
         Training samples.
     plan : Plan
-        Length and files.
+        Length and files of the run.
 
     Raises
     ------
     RuntimeError
-        The net diverged; the run can be resumed from the last checkpoint.
+        If the net diverges; the run can be resumed from the last checkpoint.
     """
-    # For so small a net, more threads are slower.
+    # More threads would be slower for such a small net.
     torch.set_num_threads(1)
     quick = rounds_quickly()
     began = saved = time.monotonic()

@@ -1,4 +1,4 @@
-"""The needle net: probability of shaft and intensity of ends."""
+"""Needle net for the probability of the shaft and the intensity of ends."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from torch import nn
 from torch.nn import functional
 
 NEEDLE_WEIGHT = 4.0
-"""Additional weight of a needle pixel: most pixels are floor."""
+"""Additional weight of a needle pixel, because most pixels show the floor."""
 LOG_INTENSITY = (-16.0, 3.0)
 """Bounds of the logarithm of the intensity of ends [1/px^2]."""
-_HALF, _QUARTER, _FINE = 16, 32, 8  # channels at half, quarter and full size
+_HALF, _QUARTER, _FINE = 16, 32, 8  # number of channels at half, quarter and full size
 _DILATIONS = (1, 2, 4, 8, 4, 1)
-_FIRST_LOG_INTENSITY = -9.5  # of a new net: about one end per patch
+_FIRST_LOG_INTENSITY = -9.5  # initial value of a new net, about one end per patch
 
 
 def normalized_layer(*shape: int) -> nn.Sequential:
     """Return a convolution with batch normalization, for training.
 
-    Without it, the activations grow by ten to a hundred times, and half of the channels vanish.
+    Without it, the activations grow ten- to a hundredfold, and half of the channels vanish.
     `folded` removes it.
     """
     return nn.Sequential(nn.Conv2d(*shape, bias=False), nn.BatchNorm2d(shape[1]))
 
 
 class NeedleNet(nn.Module):
-    """Trunk at a quarter of the size with a large receptive field, and two heads at full size.
+    """Net with a trunk at quarter size and a large receptive field, and two heads at full size.
 
     Parameters
     ----------
     layer : callable
-        Returns a layer: `normalized_layer` to train a new net, a plain convolution to run. Layers
-        at full size are always plain, since their normalization doubles the duration.
+        Returns a layer: `normalized_layer` to train a new net, a plain convolution to run it.
+        Layers at full size are always plain, because normalization would double the duration.
     """
 
     def __init__(self, layer: Callable[..., nn.Module] = nn.Conv2d) -> None:
@@ -58,7 +58,7 @@ class NeedleNet(nn.Module):
             self.out.bias.copy_(torch.tensor([-2.0, _FIRST_LOG_INTENSITY]))
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Return the two maps of images.
+        """Return the two maps for images.
 
         Parameters
         ----------
@@ -68,7 +68,7 @@ class NeedleNet(nn.Module):
         Returns
         -------
         Tensor, shape (n, 2, height, width)
-            Logit of shaft, and logarithm of the intensity of ends.
+            Logit of the shaft, and logarithm of the intensity of ends.
         """
         half = functional.relu(self.first(image))
         seen = functional.relu(self.second(half))
@@ -93,7 +93,7 @@ def twice_as_large(image: torch.Tensor) -> torch.Tensor:
 
 
 def folded(net: NeedleNet) -> NeedleNet:
-    """Return the equivalent net of plain convolutions."""
+    """Return the equivalent net with plain convolutions."""
     plain, trained = NeedleNet(), copy.deepcopy(net).eval()
     for name, layer in plain.named_modules():
         if isinstance(layer, nn.Conv2d):
@@ -105,16 +105,16 @@ def folded(net: NeedleNet) -> NeedleNet:
 
 
 class StoredNet(nn.Module):
-    """The exported net, with probabilities instead of logits."""
+    """Exported net, with probabilities instead of logits."""
 
     def __init__(self, net: NeedleNet) -> None:
         super().__init__()
         self.net = net
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return probability of shaft and logarithm of the intensity of ends, (n, 1, h, w)."""
+        """Return probability of the shaft and logarithm of the intensity of ends, (n, 1, h, w)."""
         out = self.net(image)
-        # The weight of the loss multiplies the learned odds of needle.
+        # Compensate for the weight in the loss, which multiplies the learned odds of the needle.
         shaft = torch.sigmoid(out[:, :1] - math.log(1.0 + NEEDLE_WEIGHT))
         return shaft, torch.clamp(out[:, 1:], *LOG_INTENSITY)
 

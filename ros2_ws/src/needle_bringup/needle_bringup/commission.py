@@ -47,9 +47,9 @@ interrupted
 """
 _STEP, _STEP_TIME, _SETTLED = 0.002, 0.41, 1.5
 _WAY = 0.01
-# Of joint_states, by which a measured motion is too long [s].
+# Maximum age of joint_states, which makes a measured motion too long [s].
 _JOINTS_AGE = 2.0 * PERIOD
-# Faults that the command causes by itself, and those that a person causes.
+# Faults that the command triggers itself, and those that the person causes.
 _OWN = ("release", "silent hold", "emergency stop", "device/stop", "frozen driver")
 _BY_HAND = {
     "unplugged adapter": "unplug the adapter or cable of the drives",
@@ -66,7 +66,7 @@ class Row(NamedTuple):
     Attributes
     ----------
     rule, event : str
-        The rule, and what happened.
+        Safety rule, and the event that stopped the motion.
     measured, bound : float
         Motion of the insertion axis [m].
     """
@@ -83,16 +83,16 @@ class Row(NamedTuple):
 
 
 class Bench(ConformanceRig):
-    """Real drives behind the driver, in real time; positions are those that the drives measure.
+    """Real drives behind the driver, in real time, with the positions that the drives measure.
 
     Parameters
     ----------
     settings : DeviceDriverParameters
-        Of the driver.
+        Parameters of the driver.
     pedal : OperatorParameters or None
-        Of the person's hold; None: emulated drives, which this command holds by itself.
+        Parameters of the person's pedal; None for emulated drives, which need no person.
     bag : Path
-        The bag.
+        Bag to record into.
     """
 
     runner: PacedRunner
@@ -112,11 +112,11 @@ class Bench(ConformanceRig):
 
     @property
     def place(self) -> tuple[float, float]:
-        """Measured positions [m], [rad]."""
+        """Measured joint positions [m], [rad]."""
         return self.hand.joints
 
     def press(self) -> None:
-        """Wait until the person presses; without a pedal, press."""
+        """Wait until the person presses the pedal; without a pedal, press the hold."""
         if not self.has_pedal:
             super().press()
             return
@@ -124,14 +124,14 @@ class Bench(ConformanceRig):
         self.until(lambda: bool(self.hand.status.hold_owner), "the pedal")
 
     def release(self) -> None:
-        """Wait until the person has released; without a pedal, release."""
+        """Wait until the person has released the pedal; without a pedal, release the hold."""
         super().release()
         if self.hand.status.hold_owner:
             print("Release the pedal.", flush=True)
             self.until(lambda: not self.hand.status.hold_owner, "the release of the pedal")
 
     def ask(self, text: str) -> str:
-        """Return the person's answer; meanwhile the driver continues."""
+        """Return the person's answer; the driver continues to run in the meantime."""
         print(f"{text} [Enter]", flush=True)
         while not select.select([sys.stdin], [], [], 0.0)[0]:
             if self.runner.run(PERIOD):
@@ -140,12 +140,12 @@ class Bench(ConformanceRig):
 
 
 def commission(rig: ConformanceRig, ask: Ask, *, has_pedal: bool = False) -> Iterator[Row]:
-    """Run the script; `ask` shows a text to the person and returns the answer.
+    """Run the commissioning; `ask` shows a text to the person and returns the answer.
 
     Raises
     ------
     UserError
-        If the drives are real and no person holds.
+        If the drives are real and there is no pedal.
     """
     ask("No needle is mounted, and a hand is on the emergency stop.")
     rig.start()
@@ -173,7 +173,7 @@ def commission(rig: ConformanceRig, ask: Ask, *, has_pedal: bool = False) -> Ite
 
 
 def _stop(rig: ConformanceRig, fault: Fault, ask: Ask, by_hand: str) -> Row:
-    """Stop fast steps by a fault, or by what a person does."""
+    """Stop fast steps by an injected fault, or by an action of the person."""
     bound = largest_travel(fault, rig.capabilities, rig.settings)[0]
     bound += rig.settings.max_speed * _JOINTS_AGE
     if by_hand:
@@ -192,7 +192,7 @@ def _stop(rig: ConformanceRig, fault: Fault, ask: Ask, by_hand: str) -> Row:
 
 
 def _steps_until_stop(rig: ConformanceRig) -> float:
-    """Step until a step fails; return the last position before that [m]."""
+    """Move in steps until one fails; return the last position before the failure [m]."""
     outcome = "succeeded"
     while outcome == "succeeded":
         _step(rig, _STEP_TIME)
@@ -206,7 +206,7 @@ def _steps_until_stop(rig: ConformanceRig) -> float:
 
 
 def _step(rig: ConformanceRig, duration: float) -> None:
-    """Enable and press where needed, and begin a step."""
+    """Enable and press if necessary, and begin a step."""
     if rig.state != "HOLDING":
         _enable(rig)
     if not rig.hand.status.hold_owner:
@@ -215,7 +215,7 @@ def _step(rig: ConformanceRig, duration: float) -> None:
 
 
 def _enable(rig: ConformanceRig) -> None:
-    """Reset a fault, home again where needed, and switch on."""
+    """Reset a fault, home again if necessary, and enable the drives."""
     rig.release()
     rig.hand.actions.append(Publish(EMERGENCY_STOP, EmergencyStop(False)))
     if rig.state in ("FAULT", "ESTOPPED"):
@@ -250,7 +250,7 @@ def report(rows: Sequence[Row], person: str, day: datetime.date) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line; return the exit code."""
     parser = CommandParser("commission", _DESCRIPTION, _EPILOG)
     parser.add_argument(
         "--params", type=Path, required=True, metavar="FILE", help="parameters of device_driver"

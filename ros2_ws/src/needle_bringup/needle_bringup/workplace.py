@@ -20,12 +20,12 @@ _POLL = 0.05
 
 
 def checkout() -> Path:
-    """Return the checkout that this runs from.
+    """Return the checkout that contains this code.
 
     Raises
     ------
     UserError
-        If there is none: an installed package.
+        If there is none, because the package is installed.
     """
     for folder in Path(__file__).resolve().parents:
         if (folder / "scripts" / "simulate").is_file():
@@ -34,12 +34,12 @@ def checkout() -> Path:
 
 
 def make_folder(option: str, name: str, *, exist_ok: bool = True) -> Path:
-    """Return the folder of an option, created if missing.
+    """Return the folder given to an option, created if missing.
 
     Raises
     ------
     UserError
-        If it cannot be created, or exists although it must not.
+        If it cannot be created, or exists and `exist_ok` is False.
     """
     folder = Path(name).expanduser().absolute()
     try:
@@ -51,7 +51,7 @@ def make_folder(option: str, name: str, *, exist_ok: bool = True) -> Path:
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Create a folder; remove it at the end, except after a `UserError`, which may name a log."""
+    """Create a folder; remove it at the end, but not after a `UserError`, which may name a log."""
     folder = Path(tempfile.mkdtemp(prefix="needle_work_"))
     try:
         yield folder
@@ -75,7 +75,7 @@ def processes_with(name: str, value: str) -> list[tuple[int, str]]:
                 command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
                 found.append((int(entry.name), command.strip()))
         except OSError:
-            continue  # ended, or of another user
+            continue  # the process has ended, or belongs to another user
     return found
 
 
@@ -95,14 +95,14 @@ def ran(
     good : sequence of int
         Accepted exit codes.
     environment : mapping, optional
-        Replaces the environment of this process.
+        Environment of the command; by default that of this process.
     what : str
         Name for the error message.
 
     Raises
     ------
     UserError
-        If the exit code is not accepted; includes the last line of output.
+        If the exit code is not accepted; the message includes the last line of output.
     """
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode not in good:
@@ -116,7 +116,7 @@ def ran(
 def ending_descendants() -> Iterator[None]:
     """End all descendants that were started within a `with` block, by SIGTERM, then SIGKILL.
 
-    They are identified by an environment variable, also in sessions of their own.
+    They are identified by an environment variable, even in sessions of their own.
     """
     name, value = f"NEEDLE_STARTED_BY_{os.getpid()}", uuid.uuid4().hex
     os.environ[name] = value

@@ -1,4 +1,4 @@
-"""Access control of page and hold by the Host and Origin headers of connections."""
+"""Access control for page and hold, by the Host and Origin headers of connections."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 
 
 class Access:
-    """Checks the Host and Origin of connections.
+    """Check of the Host and Origin of connections.
 
     A page of another site can make a browser open connections here, but cannot forge its Origin. A
     site whose name resolves to this machine (DNS rebinding) cannot forge the Host.
@@ -31,13 +31,13 @@ class Access:
     page_port : int
         Port of the page; an Origin with another port is another site.
     hosts : sequence of str
-        Names and addresses by which browsers reach this machine, without port; by default the
-        address, if it is a particular one.
+        Names and addresses by which browsers reach this machine, without port; by default
+        `address`, if it is a specific one.
 
     Raises
     ------
     UserError
-        If browsers on other machines could use any name.
+        If `address` is unspecified and `hosts` is empty, or `address` is invalid.
     """
 
     def __init__(self, address: str, page_port: int, hosts: Sequence[str] = ()) -> None:
@@ -59,7 +59,7 @@ class Access:
         )
 
     def why_not_host(self, header: str | None) -> str:
-        """Return why a Host header is refused; empty if it is not."""
+        """Return the reason to refuse a Host header; empty if it is accepted."""
         try:
             split = urlsplit(f"//{header or ''}")
             _ = split.port  # raises for an invalid port
@@ -69,19 +69,19 @@ class Access:
         return "" if known else "foreign Host"
 
     def why_not_origin(self, header: str | None) -> str:
-        """Return why an Origin header is refused; empty if it is not. Pages always send one."""
+        """Return the reason to refuse an Origin, which pages always send; empty if accepted."""
         return "" if (header or "").lower() in self._origins else "foreign Origin"
 
 
 def listening_socket(address: str, port: int) -> socket.socket:
     """Return a listening socket; port 0 selects a free port.
 
-    Connections before the server starts wait, they are not refused.
+    Connections that arrive before the server starts are queued, not refused.
 
     Raises
     ------
     UserError
-        If the port is taken, or the address is not of this machine.
+        If the port is taken, or the address does not belong to this machine.
     """
     try:
         return socket.create_server(
@@ -101,12 +101,12 @@ def _is_loopback(address: str) -> bool:
 
 
 class Gate:
-    """ASGI application that checks requests before another application.
+    """ASGI application that checks requests before it passes them to another application.
 
     Parameters
     ----------
     app : callable
-        The other application; also an attribute.
+        The other application, also available as an attribute.
     access : Access
         Checks the requests.
     """
@@ -137,7 +137,7 @@ class Gate:
 
 
 def _forbid_framing(send: _Send) -> _Send:
-    """Forbid to show the page inside another one, which could redirect a press to it."""
+    """Prevent other pages from embedding this one, which could redirect a press to it."""
 
     async def send_with_header(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":

@@ -1,4 +1,4 @@
-"""console as a component: shows the rig on pages, and publishes what a person orders there."""
+"""console as a component: shows the rig on web pages, and publishes the commands given there."""
 
 from __future__ import annotations
 
@@ -63,19 +63,19 @@ _HOLD, _PLANE, _POINT, _RIG = "device/hold", "target_plane", "target_point", "ri
 _PROPOSED_TARGET = "needle/proposed_target"
 _SHOW_PERIOD, _CHECK_PERIOD = 0.1, 1.0
 _HOLD_SERVER_TIMEOUT = 1.0
-"""The hold's server reports at least 12 times a second [s]."""
+"""Time after which the hold's server, which reports at 12 Hz or more, counts as failed [s]."""
 _VIEW_TIMEOUT = 2.0
-"""An open page requests its views again within this time [s]."""
+"""Time within which an open page requests its views again [s]."""
 _LAG_INCREASE = 0.05
-"""A simulation whose lag grows by this from report to report is too slow [s]."""
+"""Increase of the lag between two reports at which a simulation is too slow [s]."""
 
 
-# ---- events from the port, beside Button, Pose, Point and Log ------------------------------------
+# ---- events from the port, in addition to Button, Pose, Point and Log ----------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class HoldRequest:
-    """The hold of the pages, and the number of refusals of each kind by the hold's server."""
+    """Hold of the pages, and the number of refusals of each kind by the hold's server."""
 
     hold: PageHold
     refusals: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -83,7 +83,7 @@ class HoldRequest:
 
 @dataclasses.dataclass(frozen=True)
 class ViewRequest:
-    """A page has requested a camera view."""
+    """Request of a page for a camera view."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,12 +93,12 @@ class SimulationLag:
     seconds: float
 
 
-# ---- updates to the port, beside Snapshot -------------------------------------------------------
+# ---- updates to the port, in addition to Snapshot -----------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraImage:
-    """A camera's image, grey, shape (height, width)."""
+    """Grey image of a camera, shape (height, width)."""
 
     side: str
     image: NDArray[np.uint8]
@@ -109,7 +109,7 @@ PageUpdate = Snapshot | CameraImage
 
 
 class Console(Component):
-    """Shows the rig on pages, and publishes what a person orders there.
+    """Shows the rig on web pages, and publishes the commands given there.
 
     Parameters
     ----------
@@ -151,10 +151,10 @@ class Console(Component):
         self.timers = (Timer(_SHOW_PERIOD, self._show), Timer(_CHECK_PERIOD, self._check))
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note whether there is a controller.
+        """Discard the status of a controller that has ended.
 
-        A retraction waits until steering has ended, so a controller that was killed while it
-        steered must not block it.
+        A retraction waits for the end of steering, so a controller that was killed during steering
+        must not block it.
         """
         if CONTROLLER_STATUS not in peers.publishers:
             self._picture.clear_controller()
@@ -178,7 +178,7 @@ class Console(Component):
         for event in events:
             match event:
                 case HoldRequest(PageHold(pressed=True)) if event is not requests[-1]:
-                    # An earlier press of the batch is outdated; a release always counts.
+                    # An earlier press in the batch is outdated; a release always counts.
                     continue
                 case HoldRequest():
                     yield from self._on_hold(event, at)

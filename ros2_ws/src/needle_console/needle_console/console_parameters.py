@@ -35,19 +35,19 @@ class ConsoleParameters:
         Raises
         ------
         UserError
-            A parameter out of bounds, or the same port twice.
+            If a parameter is out of bounds, or both ports are the same.
         """
         check_fields(self)
         if self.port == self.hold_port:
             raise UserError(f"port and hold_port are both {self.port}, expected two")
 
     def why_no_hold(self, simulated: bool | None, *, is_local: bool) -> str:
-        """Return why a page may only watch and stop; empty: it may hold.
+        """Return the reason why a page may only watch and stop; empty if it may hold.
 
         Parameters
         ----------
         simulated : bool or None
-            Whether the device reports that it is simulated; None: unknown.
+            Whether the device reports that it is simulated; None if unknown.
         is_local : bool
             Whether the page is shown on the rig's own machine.
         """
@@ -58,6 +58,6 @@ class ConsoleParameters:
         return "watching only: hold_real_rig is off, and this is not a simulation"
 
     def access(self) -> Access:
-        """Return the access control; raises as `Access`."""
+        """Return the access control; errors are those of `Access`."""
         hosts = [host for host in self.hosts if host]
         return Access(self.address, self.port, hosts)

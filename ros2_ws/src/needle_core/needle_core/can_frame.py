@@ -19,9 +19,9 @@ class CanFrame:
     data : bytes
         0..8 bytes.
     remote : bool
-        Whether it requests the frame with this identifier; it has no data.
+        Whether this is a remote request for the frame with this identifier; it carries no data.
     time : float or None
-        Steady time of arrival, if the port measures it [s].
+        Monotonic arrival time [s]; None if the port does not measure it.
     """
 
     identifier: int

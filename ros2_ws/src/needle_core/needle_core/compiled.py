@@ -18,7 +18,7 @@ _COMPILED = re.compile(rb"^(@compiled|@inlined|@parallel|# Read by compiled code
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function of numbers and arrays at its first call; a decorator.
+    """Decorate a function of numbers and arrays so that its first call compiles it.
 
     The code follows IEEE 754 like Python's floats: no reordering, no fused multiply-add. Therefore
     the results depend neither on the number of elements of a call nor on inlining, which differs
@@ -42,7 +42,7 @@ def compiled(function: Function) -> Function:
 
 
 def parallel(function: Function) -> Function:
-    """Compile like `compiled` a function that loops with `numba.prange` over independent items.
+    """Compile, like `compiled`, a function that uses `numba.prange` to loop over independent items.
 
     NUMBA_NUM_THREADS threads share the iterations; the results do not depend on their number.
     """
@@ -52,7 +52,7 @@ def parallel(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Compile like `compiled` a function that loops of other compiled functions call.
+    """Compile, like `compiled`, a function that other compiled functions call in loops.
 
     Its code is inlined into the caller, so that the compiler can vectorise the loop.
     """
@@ -84,7 +84,7 @@ def _package_root(module: Path) -> Path:
 
 @functools.cache
 def _cache_directory(package: Path) -> str:
-    """Return the cache folder for the present sources of a package; "" if none is writable."""
+    """Return the cache folder for the current sources of a package; "" if none is writable."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in [Path(__file__), *sorted(package.rglob("*.py"))]:
         source = path.read_bytes()
@@ -100,7 +100,7 @@ def _cache_directory(package: Path) -> str:
 
 
 def _places() -> list[Path]:
-    """Return the candidates for the cache's place, best first."""
+    """Return the candidate cache folders, best first."""
     named = (os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
     places = [Path(place) for place in named if place]
     # Path.home() fails if neither HOME nor the password database names a home.

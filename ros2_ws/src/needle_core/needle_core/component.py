@@ -16,7 +16,7 @@ from needle_core.diagnostics import Diagnostic
 
 @dataclass(frozen=True)
 class Moment:
-    """Times at which a handler runs.
+    """Clock readings that are passed to a handler.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class Delivery:
-    """Quality of service of a topic; in ROS the QoS profile.
+    """Quality of service of a topic: the QoS profile in ROS.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ RELIABLE = Delivery()
 LATCHED = Delivery(depth=1, latched=True)
 BEST_EFFORT = Delivery(depth=1, reliable=False)
 JOINT_STATES = Delivery(depth=200)
-"""Four seconds at 50 Hz, for a receiver that is suspended meanwhile."""
+"""Queue for 4 s at 50 Hz, so that a suspended receiver loses no message."""
 IMAGES = Delivery(depth=5)
 IMAGES_BEST_EFFORT = Delivery(depth=2, reliable=False)
 
@@ -157,7 +157,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """Topic that the component publishes; `exclusive`: only one process of a machine may do so."""
+    """Topic that the component publishes; `exclusive` permits only one publisher per machine."""
 
     topic: str
     message: type[Any]
@@ -167,7 +167,7 @@ class Output:
 
 @dataclass(frozen=True)
 class PortChange:
-    """Loss of a port, or its recovery: the runner reopens ports by itself.
+    """Loss or recovery of a port; the runner reopens ports by itself.
 
     Attributes
     ----------
@@ -203,13 +203,13 @@ class RealPort(Protocol):
     """Real implementation of a component's port; it may have a reader thread."""
 
     def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
-        """Start; `arrive` accepts input from any thread."""
+        """Open the port; `arrive` accepts input from any thread."""
 
     def send(self, batch: tuple[Any, ...]) -> None:
         """Send a batch; never block."""
 
     def close(self) -> None:
-        """Stop, after all sent batches have left."""
+        """Close the port after all pending batches have been sent."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ class Timer:
 
 
 ANSWER_TIMEOUT = 5.0
-"""Time after which a call without an answer has failed [s]."""
+"""Time after which a call without an answer counts as failed [s]."""
 
 
 @dataclass(frozen=True)
@@ -281,7 +281,7 @@ class Peers:
 
     @staticmethod
     def of(components: Iterable[Component]) -> Peers:
-        """Return the peers of a component that has discovered these, itself included."""
+        """Return the graph that consists of these components."""
         publishers: dict[str, tuple[str, ...]] = {}
         subscribers: dict[str, tuple[str, ...]] = {}
         services: list[str] = []
@@ -306,9 +306,9 @@ class Component:
     name : str
         Name of the node.
     settings : object
-        Settings dataclass: the parameters of the node; None without parameters.
+        Settings dataclass with the node's parameters; None if it has none.
     accepts_simulated_time : bool
-        Whether its stamps may come from a player's clock: for viewers, which move nothing.
+        Whether its stamps may come from a player's clock; only for viewers, which cause no motion.
     inputs, outputs, services, timers, ports : sequences of rows
         Declarations of the component; empty by default.
     """

@@ -47,7 +47,7 @@ def ros_type(kind: type[Any]) -> str:
 def from_ros(kind: type[Any], message: Any) -> Any:
     """Return a ROS message of either family as a message of class `kind`.
 
-    Only the form is checked; the receiver checks the values.
+    Only the structure is checked; the receiver checks the values.
     """
     return TABLE[kind].from_ros(message)
 
@@ -111,7 +111,7 @@ def _hold_fields(message: m.HoldState, t: MessageTypes) -> dict[str, Any]:
 
 
 def _hold(message: Any) -> m.HoldState:
-    """Return the hold of a Joy message; without a button or an axis it is a release."""
+    """Return the hold state in a Joy message; without a button or an axis it is a release."""
     axes, buttons = message.axes, message.buttons
     return m.HoldState(
         *m.HoldState.split_sender(message.header.frame_id),

@@ -37,12 +37,12 @@ class OutOfBoundsError(UserError, ValueError):
 
 
 def _format(value: float) -> str:
-    """Return a whole number in full, such as 2147483647, any other with six digits."""
+    """Format a whole number in full, such as 2147483647, and any other with six digits."""
     whole = float(value).is_integer() and abs(value) < 1e12
     return f"{value:.0f}" if whole else f"{value:g}"
 
 
 def did_you_mean(name: str, known: Collection[str]) -> str:
-    """Return the known name that is most similar to a misspelt one, as a hint, or all of them."""
+    """Return a hint: the known name most similar to a misspelt one, or all known names."""
     close = difflib.get_close_matches(name, known, n=1)
     return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}"

@@ -49,7 +49,7 @@ class TrajectoryPoint:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Command; its stamp is that of the tip that caused it."""
+    """Motion command with the stamp of the tip that caused it."""
 
     stamp_ns: int
     joint_names: tuple[str, ...]
@@ -218,7 +218,7 @@ class Image:
 
 @dataclass(frozen=True)
 class CompressedImage:
-    """Image as the bytes of a file; `format` is jpeg or png."""
+    """Image as an encoded file; `format` is jpeg or png."""
 
     stamp_ns: int
     frame_id: str
@@ -228,7 +228,7 @@ class CompressedImage:
 
 @dataclass(frozen=True)
 class RegionOfInterest:
-    """Part of the sensor in the image [px]; 0x0 is the whole sensor."""
+    """Part of the sensor that the image covers [px]; 0x0 is the whole sensor."""
 
     x_offset: int = 0
     y_offset: int = 0
@@ -325,15 +325,15 @@ class LogLine:
 class HoldSession:
     """Creates the hold messages of one source.
 
-    Their number reveals late messages; the session separates them from an earlier process of the
-    same name.
+    The message number reveals late messages; the session distinguishes them from those of an
+    earlier process with the same name.
 
     Parameters
     ----------
     source : str
         Name of the source, unique on the graph.
     lifetime : float
-        Time for which a message is valid [s]; infinite: the device's own time-out applies.
+        Time for which a message is valid [s]; if infinite, the device's own time-out applies.
     """
 
     def __init__(self, source: str, lifetime: float = HOLD_LIFETIME) -> None:
@@ -347,7 +347,7 @@ class HoldSession:
         Parameters
         ----------
         stamp_ns : int
-            Present time [ns]. The time of the first message becomes the session, because no other
+            Current time [ns]. The time of the first message becomes the session, because no other
             process of this source starts in the same nanosecond.
         pressed : bool
             Whether hold to run is pressed.
@@ -363,7 +363,7 @@ class HoldSession:
 def quaternion_from_rotation(rotation: Sequence[Sequence[float]]) -> Quaternion:
     """Return the unit quaternion (x, y, z, w) of a rotation matrix, given as three rows.
 
-    Of the four formulas it uses the one with the largest divisor, like scipy, whose import would
+    Like scipy, it uses the one of four formulas with the largest divisor. Importing scipy would
     cost each process a quarter of a second.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation

@@ -15,7 +15,7 @@ from needle_core.messages import Vector3
 
 # Version, type, name, seconds and fraction of the stamp, size and checksum of the body.
 _HEADER = struct.Struct(">H12s20sIIQQ")
-# Size of the extended header, of the metadata's index and of its keys and values.
+# Sizes of the extended header, of the metadata's index and of all metadata; one key and value.
 _EXTENDED, _PAIR = struct.Struct(">HHI4x"), struct.Struct(">H2xI")
 _MATRIX, _POINT = struct.Struct(">12f"), struct.Struct(">64s36x3f24x")
 _LARGEST_BODY = 1 << 20  # [bytes]
@@ -23,7 +23,7 @@ _MASK, _POLYNOMIAL = (1 << 64) - 1, 0x42F0E1EBA9EA3693
 
 
 class LinkMessage(NamedTuple):
-    """A message: version of its header, type, device name, stamp [s] since 1970 (0: none), body."""
+    """Message with header version, type, device name, stamp [s] since 1970 (0: none) and body."""
 
     version: int
     kind: str
@@ -56,7 +56,7 @@ class LinkMessage(NamedTuple):
         Raises
         ------
         UserError
-            A wrong checksum, or a body that is not a matrix.
+            If the checksum is wrong, or the body is not a matrix.
         """
         if checksum(self.body) != self.crc:
             raise UserError("wrong checksum")
@@ -89,8 +89,8 @@ class LinkStream:
     Parameters
     ----------
     restart : str
-        After an unreadable header, the stream continues at the next message of this type. Empty:
-        it ignores the bytes from there on.
+        After an unreadable header, the stream continues at the next message of this type. If
+        empty, it ignores all further bytes.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class LinkStream:
         self._restart = restart.encode().ljust(12, b"\0") if restart else b""
 
     def split(self, data: bytes) -> Iterator[LinkMessage]:
-        """Yield the messages that are complete with `data`."""
+        """Yield the messages that `data` completes."""
         if self.problem and not self._restart:
             return
         self.problem, self._rest = "", self._rest + data

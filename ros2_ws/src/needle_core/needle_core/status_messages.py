@@ -1,7 +1,7 @@
 """Key-value messages device/status and needle/controller_status as dataclasses.
 
-A field is named after its key, which ends in its unit. A missing or malformed value keeps the
-field's default, because another node may have sent it.
+A field has the name of its key, which ends in the unit. A missing or malformed value leaves the
+field's default, because another node may have sent the message.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class KeyValues:
     Attributes
     ----------
     part : str
-        Part of the node that it describes.
+        Part of the node that the status describes.
     source : str
         Full name of the node that sent it.
     level : Level
@@ -41,7 +41,7 @@ class KeyValues:
 
     @classmethod
     def parse(cls: type[_Kind], values: Mapping[str, str]) -> _Kind:
-        """Return the status of an unnamed node from key-value pairs."""
+        """Return the status in key-value pairs, without the node's name."""
         read: dict[str, Any] = {}
         for key, reader in _KEYS[cls]:
             if key in values:
@@ -53,7 +53,7 @@ class KeyValues:
 
     @classmethod
     def of(cls: type[_Kind], status: Status) -> _Kind:
-        """Return the status from a DiagnosticStatus."""
+        """Return the content of a DiagnosticStatus."""
         fixed = {"source": status.source, "level": status.level, "text": status.text}
         return cls(**(vars(cls.parse(status.values)) | fixed))
 
@@ -84,11 +84,11 @@ class DeviceStatus(KeyValues):
     Attributes
     ----------
     state, activity : str
-        State of the device and present motion (docs/safety.md).
+        State of the device and its current motion (docs/safety.md).
     homed : bool
         Whether both axes are homed.
     hold_owner, press_again : str
-        Source of the valid hold; source of an ignored press, which must release first.
+        Source of the valid hold; source of an ignored press, which must be released first.
     speed_scale : float
         Share of the nominal speed, set by the hold owner.
     insertion_m, rotation_rad : float or None
@@ -98,15 +98,15 @@ class DeviceStatus(KeyValues):
     needle_out_confirmed : bool
         Whether the operator has confirmed that the needle is out.
     watchdog_trips, commands_refused : int
-        Number of holds, tips or replies that were too old; number of rejected commands.
+        Number of expired holds, tips or replies; number of rejected commands.
     holds_ignored : int
-        Number of hold messages that were late, duplicate, or of an old session.
+        Number of hold messages that were late, duplicated, or from an old session.
     command_ns : int
-        Stamp of the newest command, whatever its result; 0: none yet.
+        Stamp of the newest command, regardless of its result; 0 before the first.
     rotation_owed_rad : float
         Lag of the rotation behind the insertion while a hand pushes the needle.
     simulated : bool or None
-        Whether the device is simulated; None while unknown.
+        Whether the device is simulated; None if unknown.
     """
 
     part = "device"
@@ -130,7 +130,7 @@ class DeviceStatus(KeyValues):
 
     @property
     def why(self) -> str:
-        """Fault, else reason, else the line for the user."""
+        """The fault if there is one, else the reason, else the line for the user."""
         return self.fault or self.reason or self.text
 
 
@@ -143,7 +143,7 @@ class ControllerStatus(KeyValues):
     state : str
         IDLE, STEERING, WAITING_FOR_TIP, DONE or FAULT.
     starts, step : int or None, int
-        Number of starts (None if not given); number of completed steps.
+        Number of starts (None if missing); number of completed steps.
     insertion_m : float
         Insertion at the last used tip.
     target_offset_m : float or None
@@ -153,7 +153,7 @@ class ControllerStatus(KeyValues):
     obstacles : int
         Number of obstacles.
     reachable, reachable_depth_m : bool or None, float or None
-        Whether the target is reachable, and the smallest depth that any law needs for it.
+        Whether the target is reachable; smallest depth at which some law can reach it.
     trusted : str
         "trusted", "doubtful: " with the reason, or empty.
     r1_low_m, r1_high_m : float or None
@@ -161,7 +161,7 @@ class ControllerStatus(KeyValues):
     reason : str
         Reason of the state, or a warning.
     awaiting : str
-        Input that the next action needs: nothing, hold, tip, device or result.
+        Input that the next action requires: nothing, hold, tip, device or result.
     insertion : str
         stepwise or continuous.
     command_ns, tip_after_ns : int
@@ -255,7 +255,7 @@ def _keys(kind: type[KeyValues]) -> list[tuple[str, Callable[[str], Any]]]:
     return [(name, _READERS[types[name]]) for name in names]
 
 
-# Status class to its keys, each with the reader of its value.
+# Keys of each status class, with the parser of each value.
 _KEYS: dict[type[KeyValues], list[tuple[str, Callable[[str], Any]]]] = {
     kind: _keys(kind) for kind in (DeviceStatus, ControllerStatus)
 }

@@ -71,7 +71,7 @@ def _image(message: Any) -> m.Image:
         int(message.width),
         message.encoding,
         int(message.step),
-        # Not copied, because images are large and arrive at 60 Hz.
+        # Avoid a copy: images are large and arrive at 60 Hz.
         memoryview(message.data),
     )
 

@@ -1,4 +1,4 @@
-"""Time line of a run: states, hold, warnings and faults."""
+"""Timeline of a run: states, hold, warnings and faults."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def level_name(level: int) -> str:
 
 
 def _spans(changes: Sequence[tuple[int, str | None]], end: int) -> list[Span]:
-    """Return the periods between changes of colour (time [ns], colour); None: no span."""
+    """Return the periods between changes of colour (time [ns], colour); None draws no span."""
     groups = itertools.groupby(changes, key=itemgetter(1))
     begins = [(next(group)[0], color) for color, group in groups]
     ends = [*(time for time, _ in begins[1:]), end]

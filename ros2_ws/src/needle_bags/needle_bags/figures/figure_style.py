@@ -23,12 +23,12 @@ PLUM, TEAL, RED = "#7a1050", "#2099c0", "#b3140c"
 # For zero lines and shadows only.
 GREY = "#9aa0a8"
 BROAD: dict[str, Any] = {"color": TRUTH, "lw": 3.6, "solid_capstyle": "round"}
-"""Style of the truth: broad, so that a thin line can be drawn over it."""
+"""Style of the ground truth: wide, so that a thin line can be drawn over it."""
 MM = 1e3
 # Narrow enough to read the text on a phone [inch].
 WIDTH = 5.6
-# Space between rows for a title and an axis; at the sides for five digits and a label, for an axis
-# with its label, and for a title [inch].
+# Space between rows for a title and an axis, and margins: at the left for five digits and a label,
+# at the bottom for an axis with its label, and at the top for a title [inch].
 _GAP = 0.34
 _MARGINS = {"left": 0.75, "right": 0.12, "bottom": 0.5, "top": 0.3}
 STYLE: dict[Any, Any] = {
@@ -63,7 +63,7 @@ def png_size(png: bytes) -> tuple[int, int]:
 def stacked(rows: int, height: float, **margins: float) -> Iterator[tuple[Figure, list[Any]]]:
     """Yield a figure and its axes, one below the other, in the common style.
 
-    Fixed margins place them; a layout engine takes three times as long.
+    The margins are fixed, because a layout engine would take three times as long.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def stacked(rows: int, height: float, **margins: float) -> Iterator[tuple[Figure
     height : float
         Height of the figure [inch].
     **margins : float
-        `left`, `right`, `bottom` and `top`, if not the defaults [inch].
+        Values of `left`, `right`, `bottom` and `top` that replace the defaults [inch].
     """
     left, right, bottom, top = (margins.get(side, inch) for side, inch in _MARGINS.items())
     row = (height - bottom - top - _GAP * (rows - 1)) / rows
@@ -89,7 +89,7 @@ def stacked(rows: int, height: float, **margins: float) -> Iterator[tuple[Figure
 
 
 def draw_goal(axes: Any, plane: float = 0.0) -> None:
-    """Draw the target plane at a height [m], with the band in which a run has converged."""
+    """Draw the target plane at a height [m], with the band in which a run counts as converged."""
     band = ((plane - GOAL) * MM, (plane + GOAL) * MM)
     axes.axhspan(*band, color=GOAL_BAND, alpha=0.16, lw=0)
     axes.axhline(plane * MM, color=GOAL_BAND, lw=1.3)

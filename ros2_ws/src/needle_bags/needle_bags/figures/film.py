@@ -32,14 +32,14 @@ Image = npt.NDArray[np.uint8]
 Projection = Callable[[Floats], Floats]
 
 MAX_BYTES = 30_000
-"""Size limit of a camera image; a film of both cameras has at most 3.7 MB, 5 MB as text."""
+"""Size limit of a camera image; a film of both cameras has at most 3.7 MB, 5 MB in base64."""
 _LARGEST_PX = (480, 400)
-# Tried in this order.
+# JPEG qualities, tried in this order.
 _QUALITIES = (75, 60, 45, 30, 15, 5, 1)
 _MAX_POINTS = 24
 _MAX_COORDINATE_PX = 1e4
 MAX_FRAMES = 61
-"""Every 2 mm of 120 mm, and the start."""
+"""One frame every 2 mm of 120 mm, and the start."""
 
 READINGS = (
     "Insertion",
@@ -59,9 +59,9 @@ class Frame:
     Attributes
     ----------
     stamp : int
-        Its time, ROS clock [ns].
+        Time of exposure, ROS clock [ns].
     shaft : (n, 3) float64
-        Measured needle, from the entry point to the tip, in `rig` [m]; empty: no tip.
+        Measured needle, from the entry point to the tip, in `rig` [m]; empty without a tip.
     needle : (m, 3) float64
         The true needle if the bag has it, otherwise the measured one.
     readings : tuple of str
@@ -77,8 +77,8 @@ class Frame:
 def film_of(run: Run) -> list[Frame]:
     """Return the frames of a run's film, at most `MAX_FRAMES`.
 
-    Each is an exposure of the cameras, or of the simulated sensor without images. They are equally
-    spaced by the motion of the needle, so that a resting needle takes no frames.
+    Each is an exposure of the cameras or, without images, of the simulated sensor. They are spaced
+    by equal motion of the needle, so that a needle at rest takes up no frames.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def film_of(run: Run) -> list[Frame]:
 
 
 def _spread(insertion: Floats) -> npt.NDArray[np.int64]:
-    """Return indices that are equally spaced by the motion of the needle, (N,)."""
+    """Return indices that are spaced by equal motion of the needle, (N,)."""
     if len(insertion) <= MAX_FRAMES:
         return np.arange(len(insertion))
     travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(insertion)))])
@@ -155,7 +155,7 @@ def _at(series: Series, values: Floats, stamps: Stamps) -> Floats:
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A picture for all frames, or one for each, with the needle drawn over it.
+    """Picture for all frames, or one per frame, with the needle drawn over it.
 
     Attributes
     ----------
@@ -166,7 +166,7 @@ class View:
     pictures : sequence of bytes
         A JPEG for each frame, empty if the bag has none; or one PNG for all frames.
     lines : sequence of (n, 2) float64
-        The needle in each frame, from the entry point to the tip; empty: not drawn.
+        The needle in each frame, from the entry point to the tip; empty if it is not drawn.
     """
 
     name: str
@@ -182,7 +182,7 @@ class View:
 
 def projections(run: Run) -> dict[str, Projection]:
     """Return the projections of both cameras; empty without a calibration."""
-    # Compiled code, which a run without images does not need.
+    # Imported late, because a run without images does not need this compiled code.
     from needle_tracker.optics.refraction import stereo_views  # noqa: PLC0415
 
     try:
@@ -275,7 +275,7 @@ def _plan_view(run: Run, frames: Sequence[Frame], axis: int, name: str) -> View:
 
 
 def _pixels(project: Projection | None, needle: Floats) -> Floats:
-    """Return the pixels of a needle, thinned out, (n, 2)."""
+    """Return the pixels of at most `_MAX_POINTS` points of a needle, (n, 2)."""
     if project is None or not len(needle):
         return np.empty((0, 2))
     chosen = np.unique(np.linspace(0, len(needle) - 1, _MAX_POINTS).round().astype(int))

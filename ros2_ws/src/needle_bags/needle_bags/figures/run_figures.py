@@ -52,7 +52,7 @@ def run_figures(runs: Sequence[Run]) -> dict[str, Figure]:
 
 
 def is_same_needle(runs: Sequence[Run]) -> bool:
-    """Return whether both runs are of one insertion, because one is a rerun."""
+    """Return whether one run is a rerun of the other, so that both show the same insertion."""
     first, second = (run.joints.values for run in runs)
     return any(rerun_of(run) for run in runs) and np.array_equal(first, second)
 
@@ -113,7 +113,7 @@ def _draw_states(rows: Sequence[Any], run: Run, states: Series, **style: Any) ->
 
 
 def _commands(run: Run) -> tuple[Floats, Floats]:
-    """Return insertion [mm] and commanded rotation [deg]; of a rerun, a line for each step."""
+    """Return insertion [mm] and commanded rotation [deg]; for a rerun, one line per step."""
     if not rerun_of(run):
         return _insertion_mm(run, run.control_input), np.degrees(run.control_input.values[:, 2])
     insertion, begin, end = commanded_rotation(run).T
@@ -123,7 +123,7 @@ def _commands(run: Run) -> tuple[Floats, Floats]:
 
 
 def _path(runs: Sequence[Run]) -> Figure:
-    """Draw the needles from the side, against the plane, and from above."""
+    """Draw the needles from the side, relative to the plane, and from above."""
     with stacked(2, 5.2) as (figure, (side, above)):
         draw_goal(side)
         for prefix, style, run in _needles(runs):
@@ -142,7 +142,7 @@ def _path(runs: Sequence[Run]) -> Figure:
 
 
 def _errors(runs: Sequence[Run]) -> Figure:
-    """Draw the errors of measurement and estimate against the truth."""
+    """Draw the errors of measurement and estimate with respect to the truth."""
     with stacked(4, 7.6) as (figure, rows):
         for prefix, style, run in _controllers(runs):
             tips, error = finite_tips(run), tip_error(run) * MM

@@ -26,14 +26,14 @@ _COLORS = (ESTIMATE, MEASURED, PLUM, RED, INK, TEAL)
 
 
 def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
-    """Return the wall time of the stages of every step."""
+    """Draw the wall time of each stage at every step."""
     with stacked(1, 3.6, bottom=1.0) as (figure, (axes,)):
         for timing, color, mark in zip(timings, _COLORS, _MARKS, strict=False):
             insertion = run.insertion_at(timing.stamps) * MM
             milliseconds = np.maximum(timing.seconds * 1e3, 1e-2)
             axes.plot(insertion, milliseconds, mark, ms=3, color=color, label=timing.name)
         axes.set(ylabel="ms", xlabel="insertion [mm]", title="Time for each step", yscale="log")
-        # Rendering typeset powers of ten is slow.
+        # The default powers of ten are slow to render.
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.yaxis.set_minor_formatter(LogFormatter())
         figure.legend(loc="lower center", ncols=3)
@@ -41,7 +41,7 @@ def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
 
 
 def timing_rows(timings: Sequence[StageTiming]) -> list[tuple[str, ...]]:
-    """Return (stage, from what to what, steps, median, 95 %, 99 %, largest [ms]) as text."""
+    """Return (stage, meaning, steps, median, 95 %, 99 %, largest [ms]) as text."""
     rows: list[tuple[str, ...]] = []
     for timing in timings:
         figures = np.percentile(timing.seconds, [50, 95, 99, 100]) * 1e3

@@ -24,7 +24,7 @@ from needle_core.files.file_access import replace_file
 
 METADATA_VERSION: Final = 9
 _NO_LIMIT: Final = QosTime(*divmod(2**63 - 1, 10**9))
-# Default for publishers with an unknown offer.
+# Default for publishers whose QoS is unknown.
 USUAL_QOS: Final = Qos(
     QosHistory.UNKNOWN,
     0,
@@ -47,7 +47,7 @@ class DataFile:
     name : str
         File name.
     counts : dict of str to int
-        Messages for each topic.
+        Number of messages by topic.
     first, last : int or None, int
         Log times of the earliest and latest message, system clock [ns].
     """
@@ -59,7 +59,7 @@ class DataFile:
 
     @property
     def message_count(self) -> int:
-        """Messages in the file."""
+        """Number of messages in the file."""
         return sum(self.counts.values())
 
     def add(self, topic: str, log_time: int) -> None:
@@ -80,7 +80,7 @@ def bag_information(
 ) -> dict[str, Any]:
     """Return the content of metadata.yaml below `rosbag2_bagfile_information`.
 
-    Set `is_compressed` if messages are compressed one by one.
+    Set `is_compressed` if messages are compressed individually.
     """
     starts = [file.first for file in files if file.first is not None]
     start = min(starts, default=0)
@@ -121,7 +121,7 @@ def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
     Raises
     ------
     OSError
-        If the disk refuses it.
+        If the file cannot be written.
     """
     text = to_yaml({"rosbag2_bagfile_information": dict(information)})
     replace_file(directory / METADATA_FILE, text.encode())
@@ -153,7 +153,7 @@ def _topic_metadata(topic: BagTopic) -> dict[str, Any]:
 
 
 class _PlainDumper(yaml.SafeDumper):
-    """Writes no anchors, which rosbag2's reader does not support."""
+    """YAML dumper without anchors, which rosbag2's reader does not support."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

@@ -1,4 +1,4 @@
-"""Writes a rosbag2 directory: MCAP data with its index, and metadata.yaml (version 9)."""
+"""Writer of rosbag2 directories: MCAP data with an index, and metadata.yaml (version 9)."""
 
 from __future__ import annotations
 
@@ -36,31 +36,32 @@ _STAMP_END: Final = 12
 
 
 class BagWriteError(UserError):
-    """The disk refused data of a bag."""
+    """Failure to write a bag to the disk."""
 
 
 class BagWriter:
-    """A bag that is being written; not thread-safe.
+    """Writer of a bag; not thread-safe.
 
     Parameters
     ----------
     directory : Path
         The bag; created if it does not exist.
     distribution : str
-        ROS distribution whose message types the bag holds.
+        ROS distribution of the message types in the bag.
     chunk_size : int
         Bytes after which a chunk is written.
     max_file_size : int
-        Bytes of messages after which a new data file is started; 0: never.
+        Bytes of messages after which a new data file is started; 0 for never.
     compression : str
-        `none` or `zstd`, chunk by chunk.
+        `none` or `zstd`, applied to each chunk.
     describe_itself : bool
         Whether the data file repeats metadata.yaml, which contains the bag's name.
 
     Raises
     ------
     UserError
-        If the directory holds a bag already or cannot be made, or the disk refuses data.
+        If the directory already contains a bag or cannot be created, or the data file cannot be
+        written.
     """
 
     def __init__(
@@ -104,23 +105,23 @@ class BagWriter:
     def write(
         self, topic: str, data: bytes, log_time: int, publish_time: int, sequence: int = 0
     ) -> None:
-        """Append one serialised message.
+        """Append a serialised message.
 
         Parameters
         ----------
         topic : str
-            Name of a topic that was announced.
+            Name of an announced topic.
         data : bytes
             The message as CDR with its header.
         log_time, publish_time : int
-            When it was received and sent, system clock [ns].
+            Times of reception and sending, system clock [ns].
         sequence : int
             Sequence number of the publisher, 0 if it has none.
 
         Raises
         ------
         BagWriteError
-            If the disk refuses the data.
+            If the data cannot be written.
         """
         with self._writing():
             if self._max_file_size and self._file_bytes + len(data) > self._max_file_size:
@@ -137,7 +138,7 @@ class BagWriter:
             self._mcap.add_metadata(name, dict(values))
 
     def set_custom_data(self, key: str, value: str) -> None:
-        """Set a text of `custom_data` in metadata.yaml."""
+        """Set an entry of `custom_data` in metadata.yaml."""
         self._custom_data[key] = value
 
     def flush(self) -> None:
@@ -151,7 +152,7 @@ class BagWriter:
         Raises
         ------
         BagWriteError
-            If the disk refuses the data.
+            If the data cannot be written.
         """
         information = self._information()
         with self._writing():
@@ -161,7 +162,7 @@ class BagWriter:
             write_metadata(self.directory, information)
 
     def abandon(self) -> None:
-        """Close the data file as it is after a `BagWriteError`; `recover` completes the bag."""
+        """Close the unfinished data file after a `BagWriteError`; `recover` completes the bag."""
         with contextlib.suppress(OSError):
             self._stream.close()
 
@@ -171,7 +172,7 @@ class BagWriter:
         Raises
         ------
         BagWriteError
-            If the disk refuses it; the existing file is kept.
+            If it cannot be written; the existing file is kept.
         """
         with self._writing():
             write_metadata(self.directory, self._information())
@@ -183,7 +184,7 @@ class BagWriter:
     def _begin_file(self) -> None:
         name = f"{self.directory.absolute().name}_{len(self._files)}.mcap"
         self._stream = self.open_file(self.directory / name)
-        # Locked until it is closed: `recover` refuses a bag that is being recorded.
+        # The lock lasts until the file is closed; `recover` rejects a bag that is being recorded.
         fcntl.flock(self._stream, fcntl.LOCK_EX)
         self._files.append(DataFile(name))
         self._file_bytes = 0
@@ -200,7 +201,7 @@ class BagWriter:
         self._mcap.flush()  # type: ignore[no-untyped-call]
 
     def _remove_file(self) -> None:
-        """Remove the file that could not be started, so that the next attempt finds no bag."""
+        """Remove a file that could not be started, so that the next attempt finds no bag."""
         if self._files:
             with contextlib.suppress(OSError):
                 self._stream.close()
@@ -240,7 +241,7 @@ class BagWriter:
 
 
 def refuse_existing_bag(directory: Path) -> None:
-    """Raise a `UserError` if a directory holds (a part of) a bag already, or is a file."""
+    """Raise a `UserError` if a directory already contains (part of) a bag, or is a file."""
     if directory.exists() and not directory.is_dir():
         raise UserError(f"cannot record into {directory}: it is a file")
     if (directory / METADATA_FILE).exists() or any(directory.glob("*.mcap")):
@@ -248,7 +249,7 @@ def refuse_existing_bag(directory: Path) -> None:
 
 
 class BagCopy(BagWriter):
-    """A compressed bag that adds each topic with its first message.
+    """Writer of a compressed bag that adds each topic with its first message.
 
     Parameters
     ----------
@@ -262,7 +263,7 @@ class BagCopy(BagWriter):
     Raises
     ------
     UserError
-        If the directory holds a bag already or cannot be made.
+        If the directory already contains a bag or cannot be created.
     """
 
     def __init__(self, directory: Path, distribution: str, custom_data: Mapping[str, str]) -> None:
@@ -275,7 +276,7 @@ class BagCopy(BagWriter):
         Raises
         ------
         BagWriteError
-            If the disk refuses the data.
+            If the data cannot be written.
         """
         if topic.name not in self._topics:
             self.add_topic(topic)
@@ -298,7 +299,7 @@ def standard_text(text: str) -> bytes:
 
 @functools.cache
 def _jazzy() -> Typestore:
-    """Return Jazzy's types; loading them takes 0.1 s, which readers do not need."""
+    """Return Jazzy's types, loaded only when needed because this takes 0.1 s."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 

@@ -74,7 +74,7 @@ def message_class(type_name: str) -> Any:
 
 
 def unplayable(topic: BagTopic) -> str:
-    """Return why a topic cannot be played; an empty text if it can."""
+    """Return the reason why a topic cannot be played; empty if it can."""
     try:
         installed = full_definition(topic.type_name)
         message_class(topic.type_name)

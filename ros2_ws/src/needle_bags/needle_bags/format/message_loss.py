@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-# A gap is final after this many messages without a message from within it.
+# A gap is final once this many messages have arrived after it.
 CERTAIN_AFTER = 5
 
 
 class SequenceGaps:
     """Gaps in the sequence numbers of a topic with one publisher.
 
-    Every publisher counts from 1, and a message does not name its publisher: a jump may be the
-    first message of a second publisher, received before its discovery. This is the case if the
-    numbers before the jump continue.
+    Every publisher counts from 1, and messages do not identify their publisher. A jump may
+    therefore be the first message of a second publisher that has not been discovered yet. This is
+    the case if the numbers before the jump continue.
     """
 
     def __init__(self) -> None:

@@ -10,16 +10,16 @@ from needle_core.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class TopicChoice:
-    """A selection of topics; all without names and expressions.
+    """Selection of topics; all topics if there are neither names nor expressions.
 
     Attributes
     ----------
     names : tuple of str
         Absolute names, selected regardless of `exclude_regex`.
     regex : str
-        Also selects matching names; empty: none.
+        Expression that selects further names; empty for none.
     exclude_regex : str
-        Excludes matching names; empty: none.
+        Expression that excludes names; empty for none.
 
     Raises
     ------

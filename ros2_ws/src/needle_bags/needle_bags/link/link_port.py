@@ -1,7 +1,7 @@
 """TCP port of openigtlink: sends the same data to all clients and receives their messages.
 
-No client delays another or the node: one that does not read is disconnected as soon as the
-system's buffer of its connection is full, and may connect again.
+No client can delay another one or the node: a client that does not read is disconnected when its
+socket buffer is full, and may reconnect.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from needle_core.errors import UserError
 from needle_core.openigtlink import LinkMessage, LinkStream
 
 _MAX_READ = 65536
-"""Bytes that are read from a client at a time."""
+"""Maximum number of bytes per read from a client."""
 
 
 class LinkPort:
@@ -27,7 +27,7 @@ class LinkPort:
     address : str
         Address to listen on.
     port : int
-        0: any free port.
+        Port number; 0 for any free port.
 
     Raises
     ------
@@ -51,12 +51,12 @@ class LinkPort:
 
     @property
     def listeners(self) -> Listeners:
-        """Clients, and the problem of each whose input is no OpenIGTLink and therefore ignored."""
+        """Number of clients, and the problems of those whose unreadable input is ignored."""
         problems = (stream.problem for stream in self._clients.values() if stream.problem)
         return Listeners(len(self._clients), tuple(problems))
 
     def open(self, arrive: Callable[[Batch], None]) -> None:
-        """Begin; `arrive` receives the events."""
+        """Report the address; `arrive` receives all events from now on."""
         self._arrive = arrive
         address = self._server.getsockname()[0]
         arrive((Log("info", f"shows the needle at {address}, port {self.port}"),))
@@ -74,7 +74,7 @@ class LinkPort:
         list of LinkMessage
             The received messages.
         """
-        # Ends when no client waits; one that is already gone delays the others by a round.
+        # accept() raises if no client is waiting; a failed connection delays the rest by one call.
         with contextlib.suppress(OSError):
             while True:
                 client, _ = self._server.accept()
@@ -98,7 +98,7 @@ class LinkPort:
 
 
 def _received(client: socket.socket) -> bytes:
-    """Return received data; raises OSError if the client is no longer connected."""
+    """Return received data; raise an OSError if the client is no longer connected."""
     try:
         data = client.recv(_MAX_READ)
     except BlockingIOError:

@@ -1,4 +1,4 @@
-"""openigtlink as a component: needle out, targets in, as OpenIGTLink messages in mm in `rig`."""
+"""openigtlink as a component: sends the needle and receives targets, in `rig` [mm]."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ TIP, ESTIMATE, PLANE = "NeedleTipToRig", "NeedleEstimateToRig", "TargetPlaneToRi
 SHAFT, TARGET, STATUS = "NeedleShaft", "NeedleTarget", "NeedleStatus"
 SHAPE, PLAN = "NeedleShape", "NeedlePlan"
 _MM = 1e3
-# A viewer draws a line through the points of the shaft.
+# Maximum number of points on the shaft; a viewer draws a line through them.
 _MAX_POINTS = 25
-# A planner's entry farther from the rig's means that the registration is wrong [m].
+# If a planner's entry point is farther from the rig's, the registration is wrong [m].
 _ENTRY_TOLERANCE = 2e-3
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ class OpenIGTLinkParameters:
     rate: float = fixed_parameter(10.0, "Hz", "Rate of all messages.", 0.5, 30.0)
 
     def __post_init__(self) -> None:
-        """Check the fields; raises UserError as `check_fields`."""
+        """Check the fields; raise a `UserError` like `check_fields`."""
         check_fields(self)
 
 
@@ -108,7 +108,7 @@ class OpenIGTLink(Component):
     def _on_points(self, message: LinkMessage, at: Moment) -> Actions:
         """Propose the point named target*, and check the one named entry*, of a message.
 
-        The name of the message counts for points that are named otherwise; two such points are
+        Points with other names take their role from the name of the message; two such points are
         entry and target.
         """
         level, line = Level.OK, "ok"
@@ -134,7 +134,7 @@ class OpenIGTLink(Component):
         yield Diagnose("plan", Diagnostic(level, line))
 
     def _send(self, at: Moment) -> Actions:
-        # Without clients the empty message lets the port accept new ones.
+        # Without clients, an empty message makes the port accept new ones.
         yield Send(LINK, (packed(self._needle, at.stamp_ns * 1e-9) if self._listeners else b"",))
 
 

@@ -1,4 +1,4 @@
-"""Camera images of the live view: which one is shown next, and the needle drawn into it."""
+"""Camera images of the live view: choice of the next one, and drawing of the needle."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-# Without an answer of the tracker for this time, images are shown without the needle [s].
+# Without an answer from the tracker for this time, images are shown without the needle [s].
 _ANSWER_TIMEOUT = 0.5
-# Number of exposures by which a tracker may lag behind.
+# Maximum number of exposures by which the tracker may lag behind.
 _MAX_QUEUED = 6
-# BGR. Sky blue and orange can be told apart without seeing red or green.
+# BGR. Sky blue and orange are also distinguishable with red-green colour blindness.
 _SHAFT, _TIP, _TEXT = (240, 180, 60), (0, 160, 255), (255, 255, 255)
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 _RADIUS_PX = 9
@@ -24,7 +24,7 @@ _QUALITY = 80
 
 
 class LatestImages:
-    """Images of one camera that wait for the tracker's answer."""
+    """Queue of one camera's images that await the tracker's answer."""
 
     def __init__(self) -> None:
         self._queue: deque[tuple[int, Image]] = deque(maxlen=_MAX_QUEUED)
@@ -35,12 +35,12 @@ class LatestImages:
         self._queue.append((stamp_ns, image))
 
     def next(self, answered_ns: int | None, now: float) -> tuple[int, bool, Image] | None:
-        """Return the image to show now, each at most once.
+        """Return the image to show now; each image is returned at most once.
 
         Parameters
         ----------
         answered_ns : int or None
-            Exposure of the tracker's last answer [ns].
+            Exposure time of the tracker's last answer [ns].
         now : float
             Steady time [s].
 

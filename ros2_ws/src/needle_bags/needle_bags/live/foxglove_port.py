@@ -20,19 +20,19 @@ _LOOPBACK = "127.0.0.1"
 
 
 class FoxglovePort(ServerListener):
-    """The real port of `LiveView`: serves its topics as ROS 2 messages; clients can send nothing.
+    """The real port of `LiveView`: serves its topics as ROS 2 messages; clients cannot send any.
 
     Parameters
     ----------
     port : int
-        Port on loopback; 0: any.
+        Port on loopback; 0 for any free port.
     channels : iterable of Output
-        The topics. A new subscriber receives the last message of a latched one.
+        Topics to serve; a new subscriber receives the last message of a latched topic.
 
     Attributes
     ----------
     port : int
-        The port; known once open.
+        The port in use, once open.
     """
 
     def __init__(self, port: int, channels: Iterable[Output]) -> None:
@@ -45,7 +45,7 @@ class FoxglovePort(ServerListener):
         self._latched: dict[str, tuple[bytes, int]] = {}
 
     def open(self, arrive: Callable[[Batch], None]) -> None:
-        """Start; `arrive` receives the events.
+        """Start the server; `arrive` receives its events.
 
         Raises
         ------

@@ -24,9 +24,9 @@ _SHAFT, _TIP, _POINT = 1e-3, 2.5e-3, 4e-3
 _ARROW = (2e-2, 8e-4, 8e-4)
 _PLANE = (2e-4, 8e-2, 2e-1)
 _PLANE_CENTRE = 1e-1
-# Blue, orange, yellow and grey can be told apart without seeing red or green.
+# Blue, orange, yellow and grey are also distinguishable with red-green colour blindness.
 _BLUE, _ORANGE, _YELLOW, _GREY = (0.2, 0.6, 1.0), (1.0, 0.6, 0.1), (1.0, 0.9, 0.2), (0.7, 0.7, 0.7)
-# 95 % of a normal distribution in space: chi-squared with three degrees of freedom.
+# Scale of the 95 % ellipsoid: square root of chi-squared with three degrees of freedom.
 SIGMAS = 2.7955
 _ORIGIN, _UPRIGHT = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
@@ -94,7 +94,7 @@ def to_markers(needle: LiveNeedle, stamp_ns: int) -> m.Markers:
 
 
 def to_transforms(needle: LiveNeedle, stamp_ns: int) -> m.Transforms | None:
-    """Return the poses of plane, measured tip and the URDF's moved links; None without any."""
+    """Return the poses of plane, measured tip and the URDF's moving links; None without any."""
     found = []
     if needle.plane is not None:
         found.append(_transform(needle.plane.T_rig_plane, RIG, TARGET_FRAME, stamp_ns))
@@ -112,7 +112,7 @@ def to_transforms(needle: LiveNeedle, stamp_ns: int) -> m.Transforms | None:
 
 
 def fixed_transforms(bodies: Mapping[str, Array], stamp_ns: int) -> m.Transforms:
-    """Return the poses of the URDF's fixed links, from those of the cameras' bodies by side."""
+    """Return the poses of the URDF's fixed links, given the camera bodies' poses by side."""
     links = ("phantom", "stage")
     found = [m.Transform(stamp_ns, RIG, link, _ORIGIN, _UPRIGHT) for link in links]
     for side, pose in bodies.items():
@@ -133,7 +133,7 @@ def _transform(matrix: Array, parent: str, child: str, stamp_ns: int) -> m.Trans
 
 
 def _xyz(values: Array) -> m.Vector3:
-    """Return Python floats: rclpy would send a numpy scalar of another width as garbage."""
+    """Return Python floats, because rclpy sends numpy scalars of another width as garbage."""
     x, y, z = values.tolist()
     return (x, y, z)
 
@@ -144,14 +144,14 @@ def ellipsoid(covariance: Array) -> tuple[Array, Array]:
     Parameters
     ----------
     covariance : ndarray, shape (3, 3)
-        Of a position [m^2].
+        Covariance of a position [m^2].
 
     Returns
     -------
     axes : ndarray, shape (3, 3)
         Directions of the half axes as columns, right-handed.
     lengths : ndarray, shape (3,)
-        Of the half axes [m].
+        Lengths of the half axes [m].
     """
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0.0:

@@ -14,11 +14,11 @@ from needle_tracker.optics.calibration import pose_matrix, rotation_matrix
 
 Array = NDArray[np.float64]
 
-# A requested plane is in force if its offset agrees within this [m].
+# A requested plane is in force if its offset agrees with the controller's within this [m].
 _SAME_OFFSET = 1e-6
-# Estimates that end by more than this before the measured tips are outdated [m].
+# Estimates are outdated if they end more than this short of the measured tips [m].
 _OUTDATED = 5e-3
-# A needle withdrawn by more than this has left the place of its last estimate [m].
+# After a withdrawal by more than this, the last estimate no longer applies [m].
 _WITHDRAWN = 5e-4
 
 
@@ -31,11 +31,11 @@ class MeasuredTip:
     stamp_ns : int
         Time of exposure [ns].
     position : ndarray, shape (3,)
-        In `rig` [m].
+        Position in `rig` [m].
     quaternion : ndarray, shape (4,)
-        x, y, z, w of the frame whose z axis is the shaft.
+        Orientation x, y, z, w of the frame whose z axis is along the shaft.
     covariance : ndarray, shape (3, 3)
-        Of the position [m^2].
+        Covariance of the position [m^2].
     """
 
     stamp_ns: int
@@ -57,13 +57,13 @@ class TipEstimate:
     Attributes
     ----------
     position : ndarray, shape (3,)
-        Of the tip [m].
+        Position of the tip [m].
     rotation : ndarray, shape (3, 3)
         Axes of the tip's frame as columns; the third is the heading.
     covariance : ndarray, shape (3, 3)
-        Of the position [m^2].
+        Covariance of the position [m^2].
     stamp_ns : int
-        Time of exposure of the tip behind it [ns].
+        Exposure time of the measured tip behind the estimate [ns].
     """
 
     position: Array
@@ -85,16 +85,16 @@ class LiveNeedle:
     tip : MeasuredTip or None
         The last tip that was found.
     answered_ns : int or None
-        Exposure of the tracker's last answer, with or without a tip [ns].
+        Exposure time of the tracker's last answer, with or without a tip [ns].
     tip_found : bool
-        Whether that answer had a tip.
+        Whether that answer contained a tip.
     target_point : ndarray, shape (3,), or None
         The target point, in `rig` [m].
     joints : JointState
-        Last positions of the joints; none before the first.
+        Last joint positions; empty before the first message.
     planned_path : Path or None
-        Path that the controller has planned past obstacles, from the tip to the target; it belongs
-        to the estimate with the same stamp.
+        Path that the controller has planned around obstacles, from the tip to the target; it
+        belongs to the estimate with the same stamp.
     """
 
     def __init__(self) -> None:
@@ -121,7 +121,7 @@ class LiveNeedle:
         self._trail.add(self._insertion, tip.pose)
 
     def add_missing_tip(self, stamp_ns: int) -> None:
-        """Note that an exposure [ns] showed no tip."""
+        """Record that no tip was found in an exposure [ns]."""
         self.answered_ns, self.tip_found = stamp_ns, False
 
     def set_estimate(self, estimate: TipEstimate) -> None:
@@ -131,7 +131,7 @@ class LiveNeedle:
             self._estimates.add(self._insertion, self.estimate.pose)
 
     def request_plane(self, plane: TargetPlane) -> None:
-        """Note a requested target plane; the controller may reject it."""
+        """Store a requested target plane; the controller may reject it."""
         self._requested_plane = plane
 
     def set_targets(self, offset: float | None, point: Array | None) -> None:
@@ -179,7 +179,7 @@ class LiveNeedle:
         """Stamp [ns] and poses along the shaft in `rig`, from the entry to the tip, or None.
 
         Shape (n, 4, 4); z is the tangent. The shaft follows the estimated tips, or the measured
-        ones if there is no estimate; while the needle is withdrawn, its end is measured.
+        ones if there is no estimate; during a withdrawal, it ends at the measured tip.
         """
         estimate, trail = self.estimate, self._trail
         if estimate is not None and self._estimates.depth >= trail.depth - _OUTDATED:

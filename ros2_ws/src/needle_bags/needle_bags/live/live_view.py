@@ -85,7 +85,7 @@ class LiveViewParameters:
     max_turns: float = limit_parameter("max_turns")
 
     def __post_init__(self) -> None:
-        """Check the fields; raises UserError as `check_fields`."""
+        """Check the fields; raise a `UserError` like `check_fields`."""
         check_fields(self)
 
 
@@ -160,7 +160,7 @@ class LiveView(Component):
         self.timers = (Timer(1.0 / settings.rate, self._publish),)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note the subscribers; receive images only while they are displayed."""
+        """Store the peers, and subscribe to images only while they are displayed."""
         self._peers = peers
         for side in SIDES:
             is_displayed = self._is_displayed(PICTURES[side])

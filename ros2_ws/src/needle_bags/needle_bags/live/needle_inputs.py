@@ -48,7 +48,7 @@ def needle_inputs(needle: LiveNeedle) -> tuple[Input, ...]:
 
 
 def proposed_target(position: m.Vector3, stamp_ns: int) -> Publish:
-    """Return the proposal of a target point in `rig` [m]; raises UserError if it is implausible."""
+    """Propose a target point in `rig` [m]; raise a `UserError` if it is implausible."""
     if not _is_plausible(position):
         raise UserError(f"no target is at {position} m")
     return Publish(PROPOSALS.topic, m.Point(stamp_ns, RIG, position))
@@ -116,6 +116,6 @@ def _is_plausible(*parts: Any) -> bool:
 
 
 def _parts(pose: m.PoseWithCovariance) -> tuple[Any, Any, Any]:
-    """Return position, rotation (None: no orientation) and covariance of the position."""
+    """Return position, rotation (None without orientation) and covariance of the position."""
     covariance = np.array(pose.covariance).reshape(6, 6)[:3, :3]
     return np.array(pose.position), rotation_of(pose), covariance

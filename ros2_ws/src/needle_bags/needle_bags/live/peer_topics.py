@@ -44,13 +44,13 @@ class PeerTopicsParameters:
     rate: float = fields.fixed_parameter(20.0, "Hz", "Largest rate of each topic.", 0.5, 100.0)
 
     def __post_init__(self) -> None:
-        """Check the fields; raises UserError as `check_fields`."""
+        """Check the fields; raise a `UserError` like `check_fields`."""
         fields.check_fields(self)
 
 
 @dataclasses.dataclass(frozen=True)
 class PeerTopic:
-    """A topic of another package, or for it: a row of the file."""
+    """Topic published for another package or received from it: a row of the file."""
 
     topic: str = fields.parameter("", "-", "Name.")
     content: str = fields.parameter("", "-", "What it holds.", choices=tuple(_CONTENTS))
@@ -61,7 +61,7 @@ class PeerTopic:
     rotation: tuple[float, ...] = fields.parameter((0.0, 0.0, 0.0, 1.0), "-", "qx, qy, qz, qw.")
 
     def __post_init__(self) -> None:
-        """Check the fields; raises UserError as `check_fields`."""
+        """Check the fields; raise a `UserError` like `check_fields`."""
         fields.check_fields(self)
         if not self.topic:
             raise UserError("the row has no topic")
@@ -69,7 +69,7 @@ class PeerTopic:
 
     @functools.cached_property
     def T_frame_rig(self) -> Array:  # noqa: N802
-        """Transforms points of `rig` to its frame [m]."""
+        """Transform from `rig` to the frame of the topic [m]."""
         return transform_of({key: list(getattr(self, key)) for key in ("translation", "rotation")})
 
     @property
@@ -79,7 +79,7 @@ class PeerTopic:
         return m.BarePoint if kind is m.Point and not self.stamped else kind
 
     def sent(self, stamp_ns: int, poses: Array) -> Any:
-        """Return the message of poses in `rig`, shape (n, 4, 4) [m]."""
+        """Return a message with poses in `rig`, shape (n, 4, 4) [m]."""
         placed = self.T_frame_rig @ poses
         positions = (placed[:, :3, 3] * _UNITS[self.unit]).tolist()
         turns = Rotation.from_matrix(placed[:, :3, :3]).as_quat().tolist()
@@ -91,7 +91,7 @@ class PeerTopic:
         return self.message(*([stamp_ns, self.frame] if self.stamped else []), pairs[0][0])
 
     def received(self, message: m.Point | m.BarePoint) -> m.Vector3:
-        """Return a received point in `rig` [m]; raises UserError if it states another frame."""
+        """Return a received point in `rig` [m]; raise a `UserError` if it has another frame."""
         if isinstance(message, m.Point) and message.frame_id not in ("", self.frame):
             raise UserError(f"its frame is '{message.frame_id}', expected '{self.frame}'")
         position = np.array(message.position) / _UNITS[self.unit]
@@ -100,7 +100,7 @@ class PeerTopic:
 
 
 def read_peer_topics(path: Path) -> tuple[PeerTopic, ...]:
-    """Return the topics of a file; raises UserError with the row that is wrong."""
+    """Return the topics of a file; raise a `UserError` that names an invalid row."""
     content = read_yaml(path)
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise UserError(f"{path}: expected a list of {{topic: ..., content: ..., ...}}")
@@ -108,24 +108,24 @@ def read_peer_topics(path: Path) -> tuple[PeerTopic, ...]:
         fields.from_values(PeerTopic, row, f"{path}: {row.get('topic')}") for row in content
     )
     names = [row.topic for row in rows]
-    # A topic in both directions would propose the rig's own target.
+    # A topic used in both directions would propose the rig's own target.
     if twice := [name for name in names if names.count(name) > 1]:
         raise UserError(f"{path}: {twice[0]} is listed twice")
     return rows
 
 
 class PeerTopics(Component):
-    """Publishes a `LiveNeedle` as in a table, and proposes the targets of other packages.
+    """Publishes a `LiveNeedle` as a table specifies, and proposes the targets of other packages.
 
-    A message is published once per stamp of its source: a reader that differentiates it must not
-    receive one twice.
+    A message is published once per stamp of its source, because a subscriber that differentiates
+    it must not receive duplicates.
 
     Parameters
     ----------
     settings : PeerTopicsParameters
         The node's parameters.
     table : tuple of PeerTopic
-        The topics; those that hold proposed targets are received.
+        The topics; those with proposed targets are received, the others published.
     """
 
     name = "peer_topics"
@@ -176,7 +176,7 @@ class PeerTopics(Component):
                 yield Publish(row.topic, message)
 
     def _poses(self, content: str, now: int) -> tuple[int, Array] | None:
-        """Return stamp [ns] and poses in `rig`, shape (n, 4, 4) [m]; None: unknown."""
+        """Return stamp [ns] and poses in `rig`, shape (n, 4, 4) [m]; None if unknown."""
         needle = self._needle
         tip, joints, target = needle.tip, needle.joints, needle.target_point
         match content:

@@ -16,9 +16,9 @@ from needle_tracker.optics.calibration import StereoCalibration, pose_matrix
 
 Array = NDArray[np.float64]
 
-# Half side of a phantom that no window bounds, for the picture only [m].
+# Half width of the phantom in directions without a window, for display only [m].
 _HALF_SIDE = 0.07
-# A camera's body has x along its view and z upwards in its image (REP 103).
+# A camera's body frame has x along the optical axis and z upwards in the image (REP 103).
 _R_OPTICAL_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
@@ -37,7 +37,7 @@ def rig_urdf(calibration: StereoCalibration, limits: SafetyLimits, diameter: flo
     Parameters
     ----------
     calibration : StereoCalibration
-        Cameras and windows. The phantom is drawn with the needle's axis in its middle.
+        Cameras and windows. The phantom is drawn centred on the needle's axis.
     limits : SafetyLimits
         Range and speed of the joints.
     diameter : float
@@ -48,7 +48,7 @@ def rig_urdf(calibration: StereoCalibration, limits: SafetyLimits, diameter: flo
         across = int(np.argmax(np.abs(camera.window.normal[:2])))
         half[across] = abs(camera.window.point[across])
     cameras = {
-        # The angles of a body are singular only for a view along the needle.
+        # These Euler angles are singular only for a camera that looks along the needle.
         side: (_text(pose[:3, 3]), _text(Rotation.from_matrix(pose[:3, :3]).as_euler("xyz")))
         for side, pose in camera_bodies(calibration).items()
     }

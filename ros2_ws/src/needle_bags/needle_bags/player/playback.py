@@ -16,7 +16,7 @@ FASTER: Final = "\x1b[A"
 SLOWER: Final = "\x1b[B"
 FORWARD: Final = "\x1b[C"
 BACK: Final = "\x1b[D"
-# A terminal sends an arrow key as three characters, in application mode with O.
+# A terminal sends an arrow key as three characters; in application mode, the second is O.
 _KEY: Final = re.compile(r"\x1b[\[O][A-D]|.", re.DOTALL)
 
 
@@ -77,7 +77,7 @@ class PlaybackClock:
 
 
 def keys_in(text: str) -> list[str]:
-    """Return the keys in the characters of a terminal."""
+    """Split the characters from a terminal into keys."""
     return [key.replace("\x1bO", "\x1b[") for key in _KEY.findall(text)]
 
 

@@ -61,9 +61,9 @@ class PlayerOptions:
     topics : TopicChoice
         Topics to play.
     remaps : dict of str to str
-        Absolute recorded name to absolute name.
+        Absolute recorded name to absolute published name.
     loop, paused : bool
-        Repeat at the end; start paused.
+        Whether to repeat at the end; whether to start paused.
     clock : float or None
         Rate of a /clock with the recording time [Hz].
     """

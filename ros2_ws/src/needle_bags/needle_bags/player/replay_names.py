@@ -1,4 +1,4 @@
-"""Topic names of a played bag: none of its messages may ever move a needle."""
+"""Topic names of a played bag, chosen so that its messages can never move a needle."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def played_name(
     remaps : mapping
         Absolute recorded name to absolute requested name.
     beside_rig : bool
-        Whether a rig is on the graph: then everything is played under `replay/`.
+        Whether a rig is on the graph; if so, everything is played under `replay/`.
     """
     requested = remaps.get(name, name)
     if requested.startswith(f"{REPLAY}/"):

@@ -21,7 +21,7 @@ SIDES = ("left", "right")
 TOPICS = {
     f"stereo/{side}/image_raw{ending}": side for side in SIDES for ending in ("", "/compressed")
 }
-"""Relative topic to the side of its camera."""
+"""Side of the camera, by relative topic name."""
 
 Stamps = npt.NDArray[np.int64]
 
@@ -48,7 +48,7 @@ def plain_image(message: Any) -> Any:
     encoded = np.frombuffer(message.data, np.uint8)
     try:
         pixels = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if len(encoded) else None
-    except cv2.error:  # larger than OpenCV takes
+    except cv2.error:  # larger than OpenCV supports
         pixels = None
     if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint8:
         return PlainImage(message.header, 0, 0, str(message.format), 0, np.empty(0, np.uint8))
@@ -62,7 +62,7 @@ def pixels_of(image: Any, path: Path) -> npt.NDArray[np.uint8]:
     Raises
     ------
     UserError
-        If the size of the data does not fit; `path` names its bag.
+        If the data do not have the declared size; `path` is the bag for the message.
     """
     size = (image.height, image.width)
     if image.step < image.width or len(image.data) != image.height * image.step:

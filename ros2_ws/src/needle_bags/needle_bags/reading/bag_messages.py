@@ -1,9 +1,9 @@
 """Messages of a bag in the order of reception or of sending.
 
 The order of arrival at the recorder is not the order of arrival at the nodes: on a busy machine a
-topic can be late by tens of milliseconds, and an answer is recorded before its question. In the
-order of sending every message follows its causes. It is known for MCAP bags if the senders' clocks
-agree with the recorder's; otherwise the order of reception is used.
+topic can be late by tens of milliseconds, and a reply may be recorded before its request. In the
+order of sending, every message follows its causes. That order is available for MCAP bags if the
+senders' clocks agree with the recorder's; otherwise the order of reception is used.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = [
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # If the fastest message of a topic has a delay outside these bounds [ns], the clocks differ.
 _MIN_DELAY, _MAX_DELAY = -1_000_000, 200_000_000
-# With fewer messages the delay may be that of the recorder.
+# With fewer messages, even the smallest delay may be due to the recorder.
 _MIN_MESSAGES = 20
 
 
@@ -39,7 +39,7 @@ Reorder = Callable[[list[SentMessage]], list[tuple[int, SentMessage]]]
 
 
 def read_contents(path: Path) -> BagDirectory:
-    """Return a closed bag: its topics, counts and metadata.
+    """Return a closed bag with its topics, counts and metadata.
 
     Parameters
     ----------
@@ -49,14 +49,14 @@ def read_contents(path: Path) -> BagDirectory:
     Raises
     ------
     UserError
-        If there is no bag, or it is not whole.
+        If there is no bag, or it is incomplete.
     """
     with BagDirectory(path) as bag:
         return bag
 
 
 def read_messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:
-    """Yield (topic, log time [ns], message) of the wanted topics, in order of log time.
+    """Yield (topic, log time [ns], message) of the selected topics, in order of log time.
 
     Messages are decoded with the definitions in the bag.
 
@@ -85,16 +85,16 @@ def messages_as_sent(
 
 
 def raw_as_sent(path: Path, wanted: Callable[[str], bool]) -> Iterator[SentMessage]:
-    """Yield the messages of the wanted topics in the order of sending.
+    """Yield the messages of the selected topics in the order of sending.
 
-    Images do not fit into memory; each of their topics is expected in order.
+    Images do not fit into memory, so each image topic is assumed to be in that order already.
 
     Parameters
     ----------
     path : Path
         The bag.
     wanted : callable
-        Whether a topic is wanted.
+        Returns whether a topic is selected.
 
     Raises
     ------

@@ -39,7 +39,7 @@ class Series:
     values : (N, K) float64
         One row for each stamp, SI.
     received : (N,) int64
-        When each was received, system clock [ns].
+        Time of reception of each row, system clock [ns].
     """
 
     stamps: Stamps
@@ -58,7 +58,7 @@ class Series:
 
 @dataclasses.dataclass(frozen=True)
 class Status:
-    """One DiagnosticStatus: when it was received (system clock, ns), its keys and values."""
+    """Receive time (system clock [ns]) and key-value pairs of a DiagnosticStatus."""
 
     log_time: int
     values: dict[str, str]
@@ -75,7 +75,7 @@ class Result:
 
 @dataclasses.dataclass(frozen=True)
 class HealthEvent:
-    """A change in /diagnostics: a part with a problem, or recovered (level 0)."""
+    """Change in /diagnostics: a new problem of a part, or its recovery (level 0)."""
 
     log_time: int
     part: str
@@ -94,13 +94,13 @@ class Run:
     tips : Series
         Measured tips in `rig`, (N, 3) [m].
     tip_covariances : Series
-        Position covariance of every exposure, (N, 9) [m^2]; infinite: no tip found.
+        Position covariance of every exposure, (N, 9) [m^2]; infinite if no tip was found.
     truth : Series
         Ground truth in `rig`: position and quaternion x y z w, (N, 7).
     estimate : Series
         Estimate in `target_plane`: position and quaternion, (N, 7).
     estimate_covariances : Series
-        Its covariance as the message has it, (N, 36): position, rotation about fixed axes.
+        Covariance of the estimate as in the message, (N, 36): position, rotation about fixed axes.
     reduced_state : Series
         r = (x, beta, gamma) in `target_plane`, (N, 3) [m, rad, rad].
     joints : Series
@@ -112,13 +112,13 @@ class Run:
     holds : Series
         Hold pressed (0 or 1) and speed scale, (N, 2), with their time of arrival.
     controller_status, device_status : list of Status
-        In order of arrival.
+        Status messages, in order of arrival.
     results : list of Result
-        In order of arrival.
+        Results of the steps, in order of arrival.
     health : list of HealthEvent
         Problems and recoveries, in order of arrival.
     topics : dict of str to int
-        Messages for each topic.
+        Number of messages by topic.
     parameters : dict
         Node name to its parameters at the start.
     run_info, versions : dict
@@ -129,7 +129,7 @@ class Run:
     recording : dict of str to str
         Notes of the recorder or of `recover`: keys of `RECORDING`.
     namespace : str
-        Namespace of the rig's topics, ends with `/`.
+        Namespace of the rig's topics; it ends with `/`.
     """
 
     path: Path
@@ -181,9 +181,9 @@ class Run:
         return ""
 
     def parameter(self, node: str, name: str) -> Any:
-        """Return a node's parameter, None if it is not recorded.
+        """Return a node's parameter; None if it was not recorded.
 
-        The node of this rig, or otherwise the only node of that name.
+        The node is that of this rig or, failing that, the only one of that name.
         """
         own = self.parameters.get(f"{self.namespace}{node}")
         if own is not None:
@@ -204,13 +204,13 @@ def read_run(path: Path, namespace: str | None = None) -> Run:
     path : Path
         A rosbag2 directory.
     namespace : str, optional
-        Namespace of the rig; required if the bag holds several.
+        Namespace of the rig; required if the bag contains several.
 
     Raises
     ------
     UserError
-        If there is no bag, it is broken or incomplete, or it holds no needle run, or several and
-        no namespace is given.
+        If there is no bag, it is broken or incomplete, or it contains no needle run, or several
+        and no namespace is given.
     """
     contents = read_contents(path)
     custom = contents.custom_data
@@ -263,12 +263,12 @@ def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
     contents : BagDirectory
         The bag.
     wanted : str, optional
-        Namespace given by the user; required if the bag holds several rigs.
+        Namespace given by the user; required if the bag contains several rigs.
 
     Raises
     ------
     UserError
-        If the bag holds no rig, not the wanted one, or several and none is given.
+        If the bag contains no rig, not the requested one, or several and no namespace is given.
     """
     found = namespaces(contents)
     if not found:
@@ -298,7 +298,7 @@ def _statuses(messages: _Messages) -> list[Status]:
 
 
 def _health_events(messages: _Messages, namespace: str, rigs: Sequence[str]) -> list[HealthEvent]:
-    """Return the changes between problem and recovery of each part, not of other rigs' parts."""
+    """Return the problems and recoveries of each part, without the parts of other rigs."""
     own = namespace.lstrip("/")
     others = tuple(rig.lstrip("/") for rig in rigs if rig not in ("/", namespace))
     last: dict[str, tuple[int, str]] = {}
@@ -316,9 +316,9 @@ def _health_events(messages: _Messages, namespace: str, rigs: Sequence[str]) -> 
 
 
 def _series(name: str, messages: _Messages) -> Series:
-    """Return the rows of a series sorted by stamp; of equal stamps the first."""
+    """Return the rows of a series sorted by stamp, only the first of equal stamps."""
     _, width, row_of = _SERIES[name]
-    # The stamp of a hold is a counter of its source.
+    # The header stamp of a hold is a message counter, so use the time of reception.
     rows = [
         (log_time if name == "holds" else to_nanoseconds(message.header.stamp), log_time, row)
         for log_time, message in messages
@@ -340,7 +340,7 @@ def _parameters(text: str) -> dict[str, dict[str, Any]]:
 
 
 def _mapping(text: str) -> dict[str, Any]:
-    """Return YAML or JSON text as a mapping; other text under the key `text`."""
+    """Parse YAML or JSON text as a mapping; other text is stored under the key `text`."""
     try:
         value = json.loads(text) if text.lstrip().startswith("{") else load_yaml(text)
     except ValueError:
@@ -393,4 +393,4 @@ _SERIES: Mapping[str, tuple[str, int, Callable[[Any], Any]]] = {
     "commands": ("device/joint_trajectory", 2, _command),
     "holds": ("device/hold", 2, _hold),
 }
-"""Series to its topic, the length of a row, and the row of a message; None: no row."""
+"""Topic, row length and row function of each series; the function returns None for no row."""

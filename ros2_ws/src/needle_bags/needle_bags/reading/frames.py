@@ -1,4 +1,4 @@
-"""Reads a bag into pandas frames: a table for each topic, a row for each message."""
+"""Bags as pandas data frames: a table for each topic, a row for each message."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _NAMES = ("name", "joint_names")
 def read_frames(path: str | Path, topics: Collection[str] = ()) -> dict[str, pd.DataFrame]:
     """Return the topics of a bag as frames.
 
-    A column is named by the path of its field, such as `pose.position.x`; elements of an array have
-    their number, those of joints the joint's name (`position.insertion_joint`), and key-values
-    their key (`values.state`), converted to numbers if the whole column is numeric. The index
+    A column is named after the path of its field, such as `pose.position.x`. Array elements are
+    named by index, those of joints by joint (`position.insertion_joint`), and key-value pairs by
+    key (`values.state`); the latter become numbers if the whole column is numeric. The index
     `stamp` is that of the header [s]: time of exposure or sampling on the rig's clock, common to
     all messages of an exposure. Without a header it is the time of reception, which every table
     has as the column `received` ([s], system clock).
@@ -39,15 +39,15 @@ def read_frames(path: str | Path, topics: Collection[str] = ()) -> dict[str, pd.
     Returns
     -------
     dict of str to DataFrame
-        By topic name. `/diagnostics` has a row for each status.
+        Frames by topic name; `/diagnostics` has a row for each status.
 
     Raises
     ------
     UserError
-        If pandas is not installed, there is no bag, it is not whole, or it has no such topic.
+        If pandas is not installed, there is no bag, it is incomplete, or it has no such topic.
     """
     try:
-        # Optional dependency, and a second of imports.
+        # Optional dependency that takes a second to import.
         import pandas as pd  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise UserError(
@@ -76,7 +76,7 @@ def _rows(message: Any) -> Iterator[dict[str, Any]]:
 
 
 def flat_fields(message: Any) -> dict[str, Any]:
-    """Return the fields of a message of rosbags as the columns of `read_frames`."""
+    """Return the fields of a rosbags message as the columns of `read_frames`."""
     return dict(_flat(message, ()))
 
 

@@ -27,7 +27,8 @@ Copy only what a rerun needs from a bag, with the compressed images of a few exp
 compressed images differ slightly from the recorded ones: `rerun SMALL_BAG --output DIR` replaces
 them with new ones. scripts/renew_regression_bag runs both commands.
 """
-# Consecutive exposures, which the tracker follows, and distant ones, where it has to search [m].
+# Insertion depths of the kept exposures [m]: consecutive ones, in which the tracker follows the
+# tip, and distant ones, where it has to search.
 DEPTHS = (30e-3, 31e-3, 32e-3, 75e-3, 76e-3, 110e-3)
 QUALITY = 90
 NODES = ("sim_rig", "stereo_tracker", "plane_controller")
@@ -89,7 +90,7 @@ def _put_image(copy: BagCopy, message: SentMessage, source: Path) -> None:
 
 
 def _custom_data(run: Run) -> dict[str, str]:
-    """Return the custom data without paths of the recording machine."""
+    """Return the custom data, without paths on the recording machine."""
     parameters = {
         name: {"ros__parameters": values}
         for name, values in run.parameters.items()
@@ -104,7 +105,7 @@ def _custom_data(run: Run) -> dict[str, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line; return the exit code."""
     parser = CommandParser("small_bag", _DESCRIPTION, "")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a bag with images")
     parser.add_argument("small_bag", type=Path, metavar="SMALL_BAG", help="the new bag")

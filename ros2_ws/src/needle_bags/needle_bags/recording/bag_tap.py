@@ -1,7 +1,7 @@
-"""Records a virtual run into a bag, without ROS.
+"""Recording of a virtual run into a bag, without ROS.
 
-Log times are virtual, and paths, dates and host are stored in metadata.yaml only, so that the same
-seed gives the same bytes of MCAP.
+Log times are virtual, and paths, dates and host are stored only in metadata.yaml, so that equal
+seeds give byte-identical MCAP files.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class BagTap:
     components : iterable of Component
         Components of the run; their topics and settings are stored.
     others : iterable of Output
-        Topics of the runner.
+        Topics that the runner itself publishes.
     run_info : mapping
         Description of the run.
     """

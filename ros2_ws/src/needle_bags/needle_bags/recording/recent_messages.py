@@ -15,7 +15,7 @@ class RecentMessages:
     Parameters
     ----------
     seconds : float
-        How long messages are kept [s].
+        Time for which messages are kept [s].
     limit : int
         Memory limit [B]; when it is reached, the oldest messages are dropped earlier.
     """
@@ -36,7 +36,7 @@ class RecentMessages:
         return (self._messages[-1].log_time - self._messages[0].log_time) / _NANOSECONDS
 
     def latch(self, topic: str) -> None:
-        """Keep the last message of this topic regardless of its age, as for a late joiner."""
+        """Keep the last message of this topic regardless of its age, as latched topics do."""
         self._latched.add(topic)
 
     def put(self, message: Received) -> None:

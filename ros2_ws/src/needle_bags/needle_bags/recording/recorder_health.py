@@ -11,7 +11,7 @@ from needle_core.diagnostics import Level
 
 # Warn when this many bytes are queued: one second of stereo images.
 WARN_WAITING: Final = 50_000_000
-# Warn when the disk will be full within this time at the present rate [s], or when the free space
+# Warn when the disk will be full within this time at the current rate [s], or when the free space
 # is below this multiple of the reserve.
 WARN_BEFORE: Final = 120.0
 WARN_RESERVES: Final = 3
@@ -25,7 +25,7 @@ class RecorderHealth:
     recording : Recording
         The recording.
     bag : Path
-        Its directory, as the user named it.
+        Directory of the bag, as given by the user.
     """
 
     def __init__(self, recording: Recording, bag: Path) -> None:
@@ -37,14 +37,14 @@ class RecorderHealth:
     def check(
         self, period: float, lost: Mapping[str, int], refused: Sequence[str]
     ) -> tuple[Level, str]:
-        """Return the level and one line.
+        """Return the level and a one-line message.
 
         Parameters
         ----------
         period : float
             Time since the last check [s].
         lost : mapping
-            Topic to number of messages missing from the bag.
+            Number of messages missing from the bag, by topic.
         refused : sequence of str
             Reasons why topics are not recorded.
         """

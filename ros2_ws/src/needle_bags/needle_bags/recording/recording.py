@@ -1,4 +1,4 @@
-"""Writing half of the recorder: callbacks fill a queue, and a worker writes it into the bag."""
+"""Writing part of the recorder: callbacks fill a queue, and a worker writes it into the bag."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OVERHEAD: Final = 800
 RESERVE: Final = 64_000_000
 # The reserve takes at most this share of a small disk.
 LARGEST_RESERVE_SHARE: Final = 0.1
-# custom_data key: why a recording ended early.
+# custom_data key: reason why a recording ended early.
 ENDED_EARLY: Final = "recording_ended"
 # custom_data key: number of missing messages by topic, as JSON.
 MESSAGES_LOST: Final = "messages_lost"
@@ -56,7 +56,7 @@ class Received:
     data : bytes
         The message as CDR with its header.
     log_time, publish_time : int
-        When it was received and sent, system clock [ns].
+        Times of reception and sending, system clock [ns].
     sequence : int
         Sequence number of the publisher, 0 if it has none.
     """
@@ -95,7 +95,7 @@ class FreeSpace:
         self.reserve = min(reserve, int(LARGEST_RESERVE_SHARE * status.f_blocks * status.f_frsize))
 
     def usable(self) -> int:
-        """Return how many bytes may still be written; negative below the reserve."""
+        """Return the number of bytes that may still be written; negative below the reserve."""
         status = os.statvfs(self._directory)
         return int(status.f_bavail * status.f_frsize) - self.reserve
 
@@ -108,9 +108,9 @@ class Recording:
     bag : BagWriter
         The bag; only the worker uses it from now on.
     space : FreeSpace
-        Free space of its disk; the recording ends in order when none is usable.
+        Free space of its disk; the recording ends cleanly when none is usable.
     make_worker : callable
-        Makes the worker from a job runner and a closing call.
+        Creates the worker, given a job runner and a closing function.
     waiting_limit : int
         Backlog limit [B], plus an eighth for small messages; messages beyond it are dropped.
     clock : callable
@@ -119,9 +119,9 @@ class Recording:
     Attributes
     ----------
     error : str or None
-        Why the recording ended early; None while it runs.
+        Reason why the recording ended early; None if it did not.
     is_whole : bool
-        Whether the bag is complete. It is not after the disk has refused data: then `recover`
+        Whether the bag is complete. If data could not be written, it is not, and `recover`
         restores what was written.
     dropped : dict of str to int
         Number of received messages that were not written, by topic.
@@ -197,7 +197,7 @@ class Recording:
         Parameters
         ----------
         lost_before : mapping of str to int
-            Number of messages by topic that were lost before they were appended; the bag names
+            Number of messages by topic that were lost before they were appended; the bag lists
             them together with `dropped`.
         """
         self._lost_before = dict(lost_before or {})
@@ -234,7 +234,7 @@ class Recording:
         self.dropped[topic] = self.dropped.get(topic, 0) + 1
 
     def _run_job(self, job: Job) -> float:
-        """Run a job, then flush and check the disk; return when the next flush is due."""
+        """Run a job, then flush and check the disk; return the time of the next flush."""
         if self.error is not None:
             job()
             return self._clock() + FLUSH_PERIOD
@@ -243,7 +243,7 @@ class Recording:
             self._check_disk()
         except (BagWriteError, OSError) as error:
             self._abandon(error)
-        # An exception that ended the worker would leave all later messages waiting.
+        # An exception must not end the worker, or all later messages would stay queued.
         except Exception as error:  # noqa: BLE001
             self._end_early(f"{type(error).__name__}: {error}")
         return self._next_flush
@@ -312,16 +312,16 @@ def open_recording(
     distribution : str
         ROS distribution of its message types.
     max_file_size : int
-        Bytes of messages after which a new data file is started; 0: never.
+        Bytes of messages after which a new data file is started; 0 for never.
     compression : str
         `none` or `zstd`.
     reserve : int
-        Free bytes on the disk at which the recording ends in order (`FreeSpace`).
+        Free bytes on the disk at which the recording ends cleanly (`FreeSpace`).
 
     Raises
     ------
     UserError
-        If the directory holds a bag already or cannot be made, or the disk is full.
+        If the directory already contains a bag or cannot be created, or the disk is full.
     """
     refuse_existing_bag(directory)
     try:
@@ -348,10 +348,10 @@ def megabytes(count: float) -> str:
 
 
 def reuse_freed_memory() -> None:
-    """Let the C library reuse freed blocks of the size of a chunk.
+    """Make the C library reuse freed blocks of the size of a chunk.
 
-    By default it returns each to the kernel and clears a new one for the next chunk, which takes
-    two thirds of the processor time of recording images.
+    By default it returns each block to the kernel and clears a new one for the next chunk, which
+    takes two thirds of the CPU time when images are recorded.
     """
     with contextlib.suppress(AttributeError, OSError):  # other C libraries lack it
         mallopt = ctypes.CDLL(None).mallopt

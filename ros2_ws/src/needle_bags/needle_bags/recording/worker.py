@@ -1,4 +1,4 @@
-"""A worker that runs queued jobs in order, beside its owner's thread."""
+"""Worker that runs queued jobs in order, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Protocol
 
 Job = Callable[[], None]
 RunJob = Callable[[Job], float]
-"""Runs a job; returns the steady time [s] by which it wants the next call."""
+"""Runs a job; returns the monotonic time at which the next call is due [s]."""
 
 
 def no_op() -> None:
@@ -32,7 +32,7 @@ class Worker(Protocol):
 
 
 class WorkerThread:
-    """A worker with its own thread.
+    """Worker with its own thread.
 
     Parameters
     ----------

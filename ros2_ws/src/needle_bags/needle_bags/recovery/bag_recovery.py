@@ -1,4 +1,4 @@
-"""Completes a damaged bag: keeps everything before the first damage.
+"""Recovery of a damaged bag: keeps everything before the first damage.
 
 A bag of several files ends at the first damaged or missing file. A damaged file is rewritten up to
 the damage, read back, and replaced; the old file is kept as `<name>.damaged`.
@@ -77,7 +77,7 @@ class BagRecovery:
 
     @property
     def messages(self) -> int:
-        """Messages in the bag."""
+        """Number of messages in the bag."""
         return self.bag.counts.total()
 
 
@@ -90,18 +90,18 @@ class _Loss(NamedTuple):
 
 
 def recover_bag(path: Path) -> BagRecovery:
-    """Make a bag, or a single MCAP file, whole.
+    """Repair a bag, or a single MCAP file.
 
     Parameters
     ----------
     path : Path
-        The bag's directory or one of its files; or a file that is read alone.
+        Directory of the bag, one of its files, or a file to repair alone.
 
     Raises
     ------
     UserError
-        If there is no MCAP bag, it is still being recorded, nothing comes before the damage, or
-        the disk refuses the changes. Nothing is changed then.
+        If there is no MCAP bag, it is still being recorded, no data precede the damage, or the
+        changes cannot be written. In these cases nothing is changed.
     """
     folder = path if path.is_dir() else path.parent
     metadata = _information(folder)
@@ -160,7 +160,7 @@ class _Recovery:
         if self._path.is_dir():
             information = _new_information(parts, self._metadata, loss.text or _NOTHING_LOST)
             kept += _keep_original(self._path / METADATA_FILE)
-            # Before the data: after an interruption the recovery restarts with these files.
+            # Written before the data: after an interruption, recovery restarts with these files.
             write_metadata(self._path, information)
         for file, part in zip(self._files, parts, strict=False):
             if part.path.parent == self._scratch:
@@ -185,7 +185,7 @@ class _Recovery:
         return _Loss()
 
     def _read_damaged(self, file: Path) -> _Loss:
-        """Copy the records before the damage of a file to a new file; return the loss."""
+        """Copy the records before the damage in a file to a new file; return the loss."""
         new = self._scratch / file.name
         loss = _Loss()
         with new.open("wb") as stream:
@@ -209,7 +209,7 @@ class _Recovery:
         return max((part.end for part in self._parts), default=0)
 
     def _loss(self, where: str, last: int) -> _Loss:
-        """Return the loss after a damage; `last` is the latest log time before it [ns]."""
+        """Return the loss due to damage; `last` is the latest log time before it [ns]."""
         with contextlib.suppress(LookupError, TypeError):
             begin = self._metadata["starting_time"]["nanoseconds_since_epoch"]
             end = begin + self._metadata["duration"]["nanoseconds"]
@@ -296,7 +296,7 @@ class _PrefixCopy:
     Raises
     ------
     OSError
-        If the disk refuses it.
+        If the copy cannot be written.
 
     Attributes
     ----------
@@ -307,7 +307,7 @@ class _PrefixCopy:
     reason : str
         The kind of damage; empty if the data end properly.
     messages, last : int
-        Messages in the copy, and their latest log time [ns].
+        Number of messages in the copy, and their latest log time [ns].
     """
 
     def __init__(self, source: Path, target: IO[bytes]) -> None:

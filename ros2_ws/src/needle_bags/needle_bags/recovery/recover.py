@@ -32,7 +32,7 @@ recorded, nothing precedes the damage, or it cannot be written; 130 interrupted 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line; return the exit code."""
     parser = CommandParser("recover", _DESCRIPTION, _EXAMPLES)
     parser.add_argument("bag", type=Path, metavar="BAG", help="directory of the bag, or a file")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""Reports of a run, and of two in comparison, as self-contained HTML pages.
+"""Report of a run, and comparison of two runs, as self-contained HTML pages.
 
 The templates are in `static/`.
 """
@@ -45,7 +45,7 @@ TILES = (
     ("Watchdog trips", "watchdog_trips", "{:d}", ""),
     ("Wall time", "wall_s", "{:.1f}", "s"),
 )
-"""Label, key, format and unit of the run's figures."""
+"""Label, key, format and unit of the figures on the page."""
 
 
 def build_page(
@@ -55,7 +55,7 @@ def build_page(
     timings: Sequence[StageTiming],
     film: tuple[Sequence[Frame], Sequence[View]],
 ) -> str:
-    """Return the page.
+    """Return the page about a run.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def build_page(
     summary : mapping
         Its figures, from `run_summary.summarize`.
     images : mapping
-        Figure name to PNG data.
+        PNG data by figure name.
     timings : sequence of StageTiming
         Duration of each stage.
     film : pair
@@ -161,14 +161,14 @@ def _points(line: np.ndarray[Any, Any]) -> str:
 def build_pair_page(
     runs: tuple[Run, Run], summaries: tuple[Summary, Summary], images: Mapping[str, bytes]
 ) -> str:
-    """Return the page.
+    """Return the page that compares two runs.
 
     Parameters
     ----------
     runs, summaries : pairs
         A and B: the runs and their figures, from `run_summary.summarize`.
     images : mapping
-        Figure name to PNG data.
+        PNG data by figure name.
 
     Returns
     -------
@@ -180,7 +180,7 @@ def build_pair_page(
         "pair.html",
         names=[run.path.absolute().name for run in runs],
         runs=runs,
-        # The recorder's parameters name the bag, which always differs.
+        # The recorder's parameters contain the name of the bag, which always differs.
         nodes=sorted(
             node
             for node in runs[0].parameters.keys() | runs[1].parameters.keys()
@@ -231,7 +231,7 @@ def _difference(a: JsonValue, b: JsonValue) -> float | None:
 
 
 def _text(value: Any) -> str:
-    """Return a value as text, floats with six digits."""
+    """Format a value as text, floats with six digits."""
     if value is None:
         return "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

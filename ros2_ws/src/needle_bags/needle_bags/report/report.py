@@ -64,7 +64,7 @@ def write_report(run: Run, summary: dict[str, JsonValue], directory: Path | None
     Returns
     -------
     Path
-        The report.html written.
+        Path of the report.html.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def write_pair_report(
     Returns
     -------
     Path
-        The page written.
+        Path of the page.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def _png(figure: Figure) -> bytes:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line; return the exit code."""
     parser = CommandParser("report", _DESCRIPTION, _EXAMPLES)
     parser.add_argument("bag", type=Path, metavar="BAG", help="directory of the bag, or a file")
     parser.add_argument(

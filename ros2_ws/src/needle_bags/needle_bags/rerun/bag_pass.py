@@ -1,4 +1,4 @@
-"""Processes the inputs of a bag with the current code; collects recorded and new outputs."""
+"""Processing of a bag's inputs with the current code, to compare recorded and new outputs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from needle_core.message_types import to_nanoseconds
 POSE = "needle/tip_pose"
 TIP_TOPICS = ("needle/tip", POSE)
 
-# The answers to inputs this short before the end of the bag may be missing from it [ns].
+# Answers to inputs within this time before the end of the bag may be missing from it [ns].
 _END_MARGIN = 500_000_000
 _STATUS = "needle/controller_status"
 _STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -48,14 +48,14 @@ class Rerun:
     Attributes
     ----------
     recorded, today : list of Record
-        Records to compare.
+        Recorded and new outputs to compare.
     outputs : list of Output
         Outputs of the current code, in order.
     tips_without_images : int
         Number of recorded tracker answers whose images are not in the bag.
     unanswered : int
-        Number of recorded pairs that the tracker never received: before it knew the cameras, or
-        when its queue was full. They are left out.
+        Number of recorded pairs that the tracker did not process, because it had no calibration
+        yet or its queue was full. They are left out.
     """
 
     recorded: list[Record]
@@ -72,14 +72,14 @@ def has_images(run: Run) -> bool:
 
 
 def run_again(run: Run, tracker: Stage | None, controller: Stage) -> Rerun:
-    """Process a bag with the stages.
+    """Process a bag with the current tracker and controller.
 
     Parameters
     ----------
     run : Run
         The run; its bag is read again.
     tracker : Stage or None
-        Processes the images; None without images.
+        Processes the images; None for a bag without images.
     controller : Stage
         Processes the recorded tips.
 
@@ -135,9 +135,9 @@ def run_stage(
     stage : Stage
         Processes the messages.
     reorder : Reorder, optional
-        Order of the messages; by default that of sending.
+        Changes the order of the messages; by default they are in the order of sending.
     change : Change, optional
-        Replaces messages.
+        Replaces messages before they are processed.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def run_stage(
 
 
 def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Output]:
-    """Process the joints of a bag with the controller, and tips that replace the recorded ones.
+    """Process a bag with the controller, with new tips in place of the recorded ones.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Out
     controller : Stage
         Processes the tips.
     answers : sequence of Output
-        Answers of the current tracker; they replace the recorded answers of the same stamps.
+        Answers of the current tracker, which replace the recorded answers with the same stamps.
 
     Returns
     -------
@@ -188,7 +188,7 @@ def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Out
 
 
 def estimate_errors(run: Run, outputs: Sequence[Output] | None = None) -> Errors:
-    """Return the RMS error of r = (x [m], beta [rad], gamma [rad]) against the truth, (3,).
+    """Return the RMS error of r = (x [m], beta [rad], gamma [rad]) from the truth, (3,).
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def estimate_errors(run: Run, outputs: Sequence[Output] | None = None) -> Errors
     Returns
     -------
     ndarray or None
-        None without truth or estimates.
+        RMS error; None without truth or estimates.
     """
     series = run.reduced_state
     if outputs is not None:
@@ -218,7 +218,7 @@ def estimate_errors(run: Run, outputs: Sequence[Output] | None = None) -> Errors
 def _recordable(
     recorded: Sequence[Record], outputs: Sequence[Output], end: int
 ) -> Iterator[Output]:
-    """Yield the outputs except those at the end that the bag could not record any more."""
+    """Yield the outputs, except those at the end for which the recording ended too early."""
     last: dict[str, int] = {}
     for record in recorded:
         last[record.topic] = max(record.stamp, last.get(record.topic, 0))
@@ -260,14 +260,14 @@ def in_reception_order(
     messages : list of SentMessage
         All small messages of a bag.
     namespace : str
-        Namespace of the rig's topics, ends with `/`.
+        Namespace of the rig's topics; it ends with `/`.
 
     Returns
     -------
     list of tuple
-        Time [ns] and message: the time of sending, or the earliest later one that keeps the order
-        of reception. Messages of topics that no status lists are received when they were sent. A
-        message that is not listed, although a later one of its topic is, is left out.
+        Time [ns] and message. The time is that of sending, or the earliest later time that keeps
+        the order of reception. If no status lists a topic, its messages are received when they
+        were sent. Unlisted messages are left out if a later one of the same topic is listed.
     """
     ordered = sorted(messages, key=lambda m: (m.time, m.log_time))
     received_at: dict[tuple[str, int], int] = {}

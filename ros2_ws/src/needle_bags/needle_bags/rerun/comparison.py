@@ -1,9 +1,9 @@
 """Comparison of recorded and recomputed messages, field by field.
 
-On one machine with one set of libraries the same input gives the same bits. Another processor or
-another version of numpy, OpenCV or LLVM rounds differently in the last digits, and a filter
-propagates that over 120 steps. Each tolerance is far above rounding errors (some 1e-12 relative)
-and far below the accuracy of the quantity.
+On one machine with one set of libraries, the same input gives bit-identical results. Another
+processor or version of numpy, OpenCV or LLVM rounds the last digits differently, and a filter
+propagates these differences over 120 steps. Each tolerance is far above rounding errors (about
+1e-12 relative) and far below the accuracy of the quantity.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ORIENTATION = "orientation"
 
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
-    """Allowed difference of two values of one kind: `absolute + relative * |recorded|`."""
+    """Allowed difference between two values of one kind: `absolute + relative * |recorded|`."""
 
     unit: str
     absolute: float
@@ -49,14 +49,14 @@ COVARIANCE = Tolerance("of sigmas", 0.0, 1e-3, "no variance is known to a thousa
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """A part of a message that is compared as a unit.
+    """Part of a message that is compared as a unit.
 
     Attributes
     ----------
     name : str
         Name in the report.
     paths : tuple of str
-        Its members in the message, such as `vector.x`.
+        Paths of its members in the message, such as `vector.x`.
     tolerance : Tolerance
         Allowed difference.
     """
@@ -71,7 +71,7 @@ def _members(path: str, members: Iterable[str] = "xyz") -> tuple[str, ...]:
 
 
 def _points(member: str) -> tuple[str, ...]:
-    # A step is one point, a path ahead two or three.
+    # A step has one point, a path of a continuous insertion two or three.
     return tuple(f"points.{k}.{member}" for k in range(3))
 
 
@@ -109,12 +109,12 @@ FIELDS: Mapping[str, tuple[Field, ...]] = {
         Field("duration", _points("time_from_start"), DURATION),
     ),
 }
-"""Relative topic to its fields with a tolerance; all other members must be equal."""
+"""Fields with a tolerance, by relative topic; all other members must be equal."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """A message: relative topic, stamp [ns] and members by path."""
+    """Message as relative topic, stamp [ns] and members by path."""
 
     topic: str
     stamp: int
@@ -132,7 +132,7 @@ class FieldResult:
     compared, differing : int
         Number of common messages, and of those that differ by more than the tolerance.
     largest : float
-        Largest difference, in `unit`; infinite if only one is a number, or texts differ.
+        Largest difference, in `unit`; infinite if texts differ or only one value is a number.
     first : int or None
         Stamp of the first differing message [ns].
     """
@@ -148,7 +148,7 @@ class FieldResult:
 
 @dataclasses.dataclass(frozen=True)
 class TopicResult:
-    """Messages of a topic that only one side has, by stamp [ns]."""
+    """Number of messages of a topic, and stamps [ns] of those that only one side has."""
 
     topic: str
     recorded: int
@@ -178,12 +178,12 @@ def compare(recorded: Iterable[Record], today: Iterable[Record]) -> Comparison:
     Parameters
     ----------
     recorded, today : iterable of Record
-        Both sides; messages of a topic with equal stamps are matched in their order.
+        Both sides; messages with equal topic and stamp are matched in order.
 
     Returns
     -------
     Comparison
-        Topics and fields in the order of `FIELDS`.
+        Results for topics and fields, in the order of `FIELDS`.
     """
     before, now = _by_topic(recorded), _by_topic(today)
     topics: list[TopicResult] = []
@@ -278,7 +278,7 @@ def _difference(a: Floats, b: Floats) -> Floats:
 
 
 def _relative_to_sigmas(a: Floats, b: Floats) -> Floats:
-    """Return the difference of two flat covariance matrices relative to their sigmas."""
+    """Return the difference of two flat covariance matrices relative to the sigmas of the first."""
     size = math.isqrt(len(a))
     with np.errstate(invalid="ignore"):
         variances = np.abs(np.diagonal(a.reshape(size, size)))

@@ -1,4 +1,4 @@
-"""Writes a copy of a bag with the outputs of the current code."""
+"""Copy of a bag with the outputs of the current code."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def write_rerun(
     *,
     shown: Sequence[Output] = (),
 ) -> None:
-    """Write the copy, and its outputs as text into `outputs.txt`.
+    """Write the copy, and the outputs as text into `outputs.txt`.
 
     Parameters
     ----------
@@ -41,10 +41,10 @@ def write_rerun(
     target : Path
         The new bag's directory.
     outputs : sequence of Output
-        Outputs of the current code. Other topics keep the recorded messages, and the tracker's
-        topics those of the stamps without outputs (their images are not in the bag).
+        Outputs of the current code. Other topics keep the recorded messages; so do the tracker's
+        topics for stamps without outputs, whose images are not in the bag.
     parameters : mapping
-        Full node name to its parameters.
+        Parameters by full node name.
     calibration : str
         The calibration.
     shown : sequence of Output
@@ -93,12 +93,12 @@ def write_rerun(
 def _changed(
     run: Run, custom: Mapping[str, str], parameters: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, str]:
-    """Return the custom data that differ from those of the original bag."""
+    """Return the custom data that differ from the original bag."""
     every = {**run.parameters, **{name: _plain(values) for name, values in parameters.items()}}
     document = {name: {"ros__parameters": values} for name, values in every.items()}
     presets = {v["preset"] for v in parameters.values() if "preset" in v}
     info = {**run.run_info, "rerun_of": run.path.absolute().name}
-    # The command of the original run does not make this bag.
+    # The command of the original run does not reproduce this bag.
     info.pop("command", None)
     if steered_by(run) is not None:
         info["steered_by"] = steered_by(run)

@@ -53,7 +53,7 @@ def describe(run: Run, comparison: Comparison) -> str:
 
 
 def outputs_table(run: Run, outputs: Sequence[Output]) -> str:
-    """Return outputs as a table with a line for each exposure, rounded.
+    """Return rounded outputs as a table with a line for each exposure.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def outputs_table(run: Run, outputs: Sequence[Output]) -> str:
 
 
 def _cells(values: Sequence[float] | None, scales: Sequence[float], digits: int) -> list[str]:
-    """Return numbers as text, dashes for none."""
+    """Format scaled numbers as text; return dashes if there are none."""
     if values is None:
         return ["-"] * len(scales)
     # Adding 0 turns a rounded -0 into 0.
@@ -174,7 +174,7 @@ def _where(run: Run, stamp: int | None) -> str:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], sides: str) -> str:
-    """Return rows under a head, columns aligned left (<) or right (>)."""
+    """Return rows under a header, with columns aligned left (<) or right (>)."""
     widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
     lines = []
     for row in (head, *rows):

@@ -1,4 +1,4 @@
-"""Parts of the rig that process the messages of a bag, and their outputs."""
+"""Stages of the rig that process the messages of a bag, and their outputs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONVERTER = Converter(rosbags_types(_STORE))
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """A message of the current code.
+    """Message from the current code.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Output:
     stamp : int
         Stamp of the message [ns].
     message : Any
-        The message, of rosbags' class.
+        The message, as an object of rosbags.
     """
 
     topic: str
@@ -55,7 +55,7 @@ class Output:
 
 
 class Stage(Protocol):
-    """A part of the rig that turns messages into outputs."""
+    """Part of the rig that turns messages into outputs."""
 
     @property
     def topics(self) -> frozenset[str]:
@@ -63,7 +63,7 @@ class Stage(Protocol):
         ...
 
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Process a message of a topic, by its relative name; return the outputs."""
+        """Process a message of a topic, given by relative name; return the outputs."""
         ...
 
     def finish(self, log_time: int) -> list[Output]:
@@ -72,14 +72,14 @@ class Stage(Protocol):
 
 
 class BagStage:
-    """A component that processes recorded messages.
+    """Stage that runs a component on recorded messages.
 
     Parameters
     ----------
     component : Component
         The component.
     received : iterable of str
-        Its output topics that have a subscriber.
+        Output topics of the component that have a subscriber.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class BagStage:
         return frozenset(self._rows)
 
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Process a message of a topic, by its relative name; return the outputs."""
+        """Process a message of a topic, given by relative name; return the outputs."""
         row, at = self._rows[topic], Moment(sent.time * 1e-9, sent.time, sent.time)
         plain = plain_image(message) if row.message is Image else message
         published = self.runner.deliver(row.topic, from_ros(row.message, plain), at)

@@ -1,4 +1,4 @@
-"""Runs plane_controller on recorded tips and joints, without a graph."""
+"""Rerun of plane_controller on recorded tips and joints, without a graph."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ _NEVER = Moment(0.0, 0)
 
 
 class ControllerStage:
-    """The current step protocol, estimator and law on the messages of a bag.
+    """Stage that runs the current step protocol, estimator and law on the messages of a bag.
 
-    Joints and results are those of the recorded device, which may belong to other commands; a step
-    with a result ends where the joints say, so that one differing decision does not end the
-    comparison. Watchdogs trip where the recorded ones did.
+    Joints and results are those of the recorded device, whose commands may have differed. A step
+    with a result ends at the recorded joint positions, so that one differing decision does not end
+    the comparison. Watchdogs trip where the recorded ones did.
 
     Parameters
     ----------
@@ -49,12 +49,12 @@ class ControllerStage:
     node : str
         Full name of the node in the bag; its parameter changes are applied.
     ends : mapping of int to JointSample
-        Stamp of a command [ns] to the joints at its end (`step_ends`).
+        Joints at the end of each command, by its stamp [ns] (`step_ends`).
 
     Attributes
     ----------
     tips : int
-        Tips used so far.
+        Number of tips used so far.
     notes : list of str
         Deviations from the recorded run.
     name : str
@@ -90,7 +90,7 @@ class ControllerStage:
         return frozenset(self._handlers)
 
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Process a message of a topic, by its relative name; return the outputs."""
+        """Process a message of a topic, given by relative name; return the outputs."""
         outputs = []
         for action in self._handlers[topic](message, sent.time):
             if not isinstance(action, Publish) or action.topic == STATUS:
@@ -101,7 +101,7 @@ class ControllerStage:
         return outputs
 
     def finish(self, log_time: int) -> list[Output]:
-        """Return no outputs: none remain at the end of a bag."""
+        """Return an empty list, as no outputs remain at the end of a bag."""
         return []
 
     def _handle_result(self, message: Any, sent_ns: int) -> Actions:
@@ -119,7 +119,7 @@ class ControllerStage:
     def _handle_status(self, message: Any, _: int) -> Actions:
         """Start, stop and time out where the recorded controller did.
 
-        Service calls and the steady clock are not recorded.
+        A bag contains neither service calls nor the steady clock.
         """
         values = values_of(message)
         before, now = self._recorded_state, values.get("state", "")

@@ -23,8 +23,8 @@ from rosbags.interfaces import (
 
 from needle_bags.reading.bag_messages import IMAGE_TYPES
 
-# Assumed depths, because DDS does not announce that of a publisher: of latched topics, of images,
-# and of other topics.
+# Assumed queue depths of latched topics, images and other topics: DDS does not announce the depth
+# of a publisher.
 UNKNOWN_LATCHED_DEPTH = 10
 UNKNOWN_IMAGE_DEPTH = 30
 UNKNOWN_DEPTH = 500
@@ -68,7 +68,7 @@ def strictest_request(offers: Sequence[TopicEndpointInfo], depth: int) -> QoSPro
 def recorded_offer(type_name: str, offers: Sequence[Qos]) -> QoSProfile:
     """Return an offer that matches every request that the recorded offers matched.
 
-    A single recorded offer is kept; of several, the strongest of each policy is used.
+    A single recorded offer is kept; of several, the strongest value of each policy is used.
     """
     unknown_depth = UNKNOWN_IMAGE_DEPTH if type_name in IMAGE_TYPES else UNKNOWN_DEPTH
     if not offers:

@@ -1,4 +1,4 @@
-"""Subscriptions to the chosen topics of the graph, as serialised messages."""
+"""Subscriptions to selected topics of the graph, with serialised messages."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from needle_core.files.bag_topic import BagTopic
 
 # Time limit of one poll of the graph; the next poll continues [s].
 GRAPH_TIME = 0.05
-# Time limit for the queued messages of one topic, so that other topics get their turn [s].
+# Time limit for handling the queued messages of one topic, so that other topics get their turn [s].
 TURN = 0.02
 # Fast DDS keeps at most this many by default; a burst during a poll must fit.
 DEPTH = 5000
-# One second of a camera. Fast DDS never releases the memory of this many images.
+# One second of camera images. Fast DDS never releases the memory of this many images.
 IMAGE_DEPTH = 30
 # A replaced subscription is kept for this time [s]: until all publishers have discovered the new
 # one, and until its queued messages and its losses have been reported.
@@ -63,14 +63,14 @@ class _Topic:
 
 
 class GraphTopics:
-    """Subscriptions to the chosen topics of the graph, including topics that appear later.
+    """Subscriptions to selected topics of the graph, including topics that appear later.
 
     Parameters
     ----------
     node : Node
         The node that subscribes.
     choice : TopicChoice
-        The chosen topics.
+        The selected topics.
     describe : callable
         Called with a topic before its first message.
     receive : callable
@@ -79,7 +79,7 @@ class GraphTopics:
     Attributes
     ----------
     refused : dict of str to str
-        Topic to the reason why it is not recorded.
+        Reasons why topics are not recorded, by topic.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class GraphTopics:
                 self._drop_replaced(topic)
         until = time.monotonic() + GRAPH_TIME
         for name, types in self._node.get_topic_names_and_types():
-            # Queued messages take precedence; the next poll does the rest.
+            # Queued messages take precedence; the next poll handles the rest.
             if time.monotonic() > until:
                 return
             if name not in self._choice or name in self.refused:
@@ -202,7 +202,7 @@ class GraphTopics:
     def _drop_replaced(self, topic: _Topic) -> None:
         """Receive the queued messages of a replaced subscription, and destroy it."""
         if topic.replaced is not None:
-            # The new subscription receives what arrives meanwhile.
+            # The new subscription receives messages that arrive in the meantime.
             depth = topic.replaced.qos_profile.depth
             for taken in islice(_queued(topic, topic.replaced), depth):
                 self._receive_one(topic, *taken)
@@ -212,7 +212,7 @@ class GraphTopics:
     def _receive_all(
         self, topic: _Topic, source: Subscription, data: bytes, info: dict[str, int]
     ) -> None:
-        """Receive a message and those queued behind it: an executor turn is more expensive."""
+        """Receive a message and those queued behind it, which saves expensive executor turns."""
         self._receive_one(topic, data, info)
         until = time.monotonic() + TURN
         for taken in _queued(topic, source):
@@ -232,7 +232,7 @@ class GraphTopics:
         topic.recent.append((sent, number))
         if not topic.described:
             self._describe(topic)
-        # Two subscriptions deliver in any order.
+        # The order is not defined while two subscriptions deliver messages.
         if number and topic.publishers == 1 and topic.replaced is None:
             topic.gaps.add(number)
         received = info["received_timestamp"] or time.time_ns()

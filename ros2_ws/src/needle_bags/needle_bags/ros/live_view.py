@@ -25,12 +25,12 @@ Serves      all of these and what Foxglove plots, with -p foxglove_port:=8765 (d
 
 
 def main() -> int:
-    """Run the node; returns its exit code."""
+    """Run the node; return its exit code."""
     return run_component(LiveView.name, LiveViewParameters, _make, help_text=HELP, ports=_ports)
 
 
 def _make(settings: LiveViewParameters, _: str) -> LiveView:
-    # No wheel on PyPI brings it.
+    # tf2_msgs is not on PyPI.
     transforms = importlib.util.find_spec("tf2_msgs") is not None
     if not transforms:
         print("live_view: no /tf, /tf_static: tf2_msgs is not installed", file=sys.stderr)

@@ -25,7 +25,7 @@ Receives    POINT with names target..., entry..., or entry and target in one mes
 
 
 def main() -> int:
-    """Run the node; returns its exit code."""
+    """Run the node; return its exit code."""
     if importlib.util.find_spec("pyigtl") is None:
         print(
             "error: pyigtl is not installed; docs/viewers.md says how to install it",

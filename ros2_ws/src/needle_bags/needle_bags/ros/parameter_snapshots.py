@@ -27,7 +27,7 @@ def plain_value(value: ParameterValue) -> Any:
     Parameters
     ----------
     value : ParameterValue
-        The message of rclpy or of rosbags.
+        Message from rclpy or rosbags.
     """
     try:
         plain = parameter_value_to_python(value)
@@ -43,7 +43,7 @@ def _plain_element(element: Any) -> Any:
 
 
 class ParameterSnapshots:
-    """Parameters of all nodes when each was first discovered, and their changes.
+    """Parameters of each node when it was first discovered, and their changes.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class ParameterSnapshots:
     Attributes
     ----------
     changes : list of dict
-        All changes since (`apply_event`), in order.
+        All later changes (`apply_event`), in order.
     """
 
     def __init__(self, node: Node, on_snapshot: Callable[[str, dict[str, Any]], None]) -> None:
@@ -73,8 +73,8 @@ class ParameterSnapshots:
     def apply_event(self, event: ParameterEvent) -> list[dict[str, Any]]:
         """Apply a message of /parameter_events; return its changes.
 
-        Each is `stamp_ns` (ROS time), `node`, `name`, `value` (None: deleted). Parameters declared
-        before the first snapshot of a node are part of the snapshot.
+        A change has `stamp_ns` (ROS time), `node`, `name`, `value` (None if deleted). Parameters
+        declared before the first snapshot of a node are part of the snapshot.
         """
         known = self._current.get(event.node)
         if known is None:
@@ -108,7 +108,7 @@ class ParameterSnapshots:
                     store = partial(self._store, full_name)
                     self._queries[full_name] = _Query(self._node, full_name, store)
                 self._queries[full_name].send()
-        # Not in the callback of an answer, which uses the client.
+        # Close clients here, because the callback of an answer still uses its client.
         for full_name in [n for n in self._queries if n in self._values or n not in present]:
             self._queries.pop(full_name).close()
 
@@ -130,8 +130,8 @@ class ParameterSnapshots:
 class _Query:
     """Requests to one node: the names of its parameters, then their values.
 
-    A request is repeated until it is answered, because an answer can be lost for good: a server
-    that has not discovered the client yet drops it without notice.
+    A request is repeated until it is answered, because an answer can be lost: a server that has not
+    discovered the client yet drops it silently.
     """
 
     def __init__(

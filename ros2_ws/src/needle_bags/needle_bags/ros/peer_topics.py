@@ -20,7 +20,7 @@ Publishes   needle/proposed_target, and the topics of `file` (docs/viewers.md)
 
 
 def main() -> int:
-    """Run the node; returns its exit code."""
+    """Run the node; return its exit code."""
     return run_component(PeerTopics.name, PeerTopicsParameters, _make, help_text=HELP)
 
 

@@ -83,7 +83,7 @@ class PlayerParameters:
 
 
 class RigAppearedError(Exception):
-    """A rig appeared while topics are played under their own names."""
+    """Appearance of a rig while topics are played under their own names."""
 
 
 class Player(WholeNode):
@@ -113,7 +113,7 @@ class Player(WholeNode):
         self.add_post_set_parameters_callback(self._on_parameters)
 
     def _playable(self) -> dict[str, BagTopic]:
-        """Return the topics to play; log why others are left out."""
+        """Return the topics to play; log the reasons why others are left out."""
         options, known = self._options, self._contents.topics
         chosen = {name: topic for name, topic in known.items() if name in options.topics}
         if not chosen:
@@ -132,12 +132,12 @@ class Player(WholeNode):
         return playable
 
     def prepare(self, spin: partial[None], end: ShutdownFlag) -> bool:
-        """Discover a rig, make the publishers, and wait for existing subscribers.
+        """Check for a rig, create the publishers, and wait for existing subscribers.
 
         Returns
         -------
         bool
-            False if `end` was requested meanwhile.
+            False if `end` was requested in the meantime.
 
         Raises
         ------
@@ -180,7 +180,7 @@ class Player(WholeNode):
             name,
             recorded_offer(topic.type_name, topic.offered_qos),
         )
-        # ROS remappings apply after those of --remap.
+        # ROS remappings apply after --remap, so check the final name.
         final = publisher.topic_name
         if not final.startswith(f"{REPLAY}/") and (
             self.beside_rig
@@ -197,7 +197,7 @@ class Player(WholeNode):
         )
 
     def _publish_latched(self, before: int) -> None:
-        """Publish the latched messages at a recording time [ns]."""
+        """Publish the last latched message of each topic before a recording time [ns]."""
         latched = {name for name, topic in self._topics.items() if topic.is_latched}
         if before == self._contents.start or not latched:
             return
@@ -242,7 +242,7 @@ class Player(WholeNode):
         self.messages += 1
 
     def check_graph(self) -> None:
-        """Publish clock and state; check for a rig.
+        """Publish the clock and the state, and check for a rig.
 
         Raises
         ------
@@ -274,7 +274,7 @@ class Player(WholeNode):
             publisher.wait_for_all_acked(timeout)
 
     def _rig(self) -> str | None:
-        """Return the publisher that belongs to a rig, as text, or None."""
+        """Return a description of a publisher that belongs to a rig, or None."""
         for name, _ in self.get_topic_names_and_types():
             if marks_a_rig(name):
                 for info in self.get_publishers_info_by_topic(name):
@@ -337,7 +337,7 @@ def _play(player: Player, loop: bool, end: ShutdownFlag) -> int:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the player; returns the exit code."""
+    """Run the player; return the exit code."""
     argv = list(sys.argv if args is None else args)
     own, ros = _split(argv[1:])
 

@@ -67,11 +67,11 @@ the bag cannot be created
 """
 
 GRAPH_PERIOD = 0.1
-# After the signal, record until no message has arrived for DRAIN_QUIET, at most DRAIN_LIMIT [s].
+# After the signal, record until no message arrives for DRAIN_QUIET, but at most DRAIN_LIMIT [s].
 DRAIN_QUIET = 0.3
 DRAIN_LIMIT = 1.0
 REPORT_PERIOD = 0.5
-# A snapshot includes this much time after the fault [s].
+# A snapshot also covers this time after the fault [s].
 FAULT_DELAY = 1.0
 PARAMETER_EVENTS = "/parameter_events"
 # Diagnostics part that names the nodes whose parameters are in the bag.
@@ -287,7 +287,7 @@ class Recorder(WholeNode):
         refused = list(self._topics.refused.values())
         level, message = self._health.check(REPORT_PERIOD, lost, refused)
         self._diagnostics.set("bag", Diagnostic(level, message, values))
-        # Log each kind of problem once; the figures behind the colon change.
+        # Log each kind of problem once; the numbers after the colon change.
         kind = message.partition(":")[0]
         if level is Level.OK or kind == self._last_warning:
             return
@@ -329,7 +329,7 @@ class Recorder(WholeNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the recorder; returns the exit code."""
+    """Run the recorder; return the exit code."""
     reuse_freed_memory()
 
     def spin(node: Node, end: ShutdownFlag) -> int:

@@ -84,7 +84,7 @@ NOT_COMPARED = {
     LiveView.name: "because its update times are not recorded",
     OpenIGTLink.name: "because ports are not recorded",
 }
-"""Viewer to the reason why its output is not compared."""
+"""Reason why the output of each viewer is not compared."""
 
 P = TypeVar("P")
 
@@ -96,9 +96,9 @@ class Node:
     Attributes
     ----------
     name : str
-        Its full name.
+        Full name of the node.
     values : mapping
-        Its parameters, including those of --params.
+        Parameters of the node, including those of --params.
     given : frozenset of str
         Names of the parameters in --params.
     """
@@ -108,7 +108,7 @@ class Node:
     given: frozenset[str]
 
     def parameters(self, kind: type[P]) -> P:
-        """Return the parameters as a parameter class; warn of those that no longer exist."""
+        """Return the parameters as a dataclass; warn about those that no longer exist."""
         names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
         known = {name: value for name, value in self.values.items() if name in names}
         unknown = [n for n in self.values if n not in names and not n.startswith(OF_EVERY_NODE)]
@@ -126,7 +126,7 @@ class Node:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `rerun`; returns its exit code."""
+    """Run `rerun`; return its exit code."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     return run_command(lambda: _run(words))
 
@@ -242,7 +242,7 @@ def _node(
 def _announced(run: Run) -> dict[str, dict[str, Any]]:
     """Return the parameters that nodes announced at their start, by full name.
 
-    A bag of ROS 2's own recorder has no others.
+    A bag from ROS 2's own recorder contains no other parameters.
     """
     found: dict[str, dict[str, Any]] = {}
     for _, _, message in read_messages(run.path, "/parameter_events".__eq__):
@@ -254,7 +254,7 @@ def _announced(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def _calibration(run: Run, node: Node) -> str:
-    """Return the text of the calibration: that of --params, or the recorded one."""
+    """Return the text of the calibration from --params, or of the recorded one."""
     if FILE in node.given:
         return read_calibration(Path(str(node.values[FILE])))
     if not run.calibration:
@@ -283,10 +283,10 @@ def _viewers(
     def settings(name: str, kind: type[P]) -> P:
         return _node(run, name, params, {}, has_defaults=True).parameters(kind)
 
-    # The recorded /tf, which other nodes publish as well, is kept.
+    # Keep the recorded /tf, because other nodes publish it as well.
     view = LiveView(settings(LiveView.name, LiveViewParameters), transforms=False)
     viewers = {view.name: BagStage(view, (output.topic for output in view.outputs))}
-    # Not every bag has the topic of the calibration.
+    # Deliver the calibration here, because not every bag contains its topic.
     list(viewers[view.name].runner.deliver(CALIBRATION, Text(calibration), begin))
     if importlib.util.find_spec("pyigtl") is not None:
         link = OpenIGTLink(settings(OpenIGTLink.name, OpenIGTLinkParameters))

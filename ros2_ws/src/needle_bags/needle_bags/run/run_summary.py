@@ -30,14 +30,14 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
     run : Run
         The recorded run.
     wall_s : float, optional
-        Seconds from the command to its result, as the caller measured them.
+        Time from the command to its result [s], measured by the caller.
 
     Returns
     -------
     dict
-        The keys of `scripts/simulate --json`; null if the bag lacks the data. r1 is the signed true
-        distance of the tip from the target plane, point_error its final distance from the target
-        point, null without a target point.
+        The keys of `scripts/simulate --json`; values are None if the bag lacks the data. r1 is the
+        signed true distance of the tip from the target plane, point_error its final distance from
+        the target point if there is one.
     """
     r1 = true_r1(run)
     depth = run.insertion_at(run.truth.stamps)
@@ -144,7 +144,7 @@ def finite_tips(run: Run) -> Series:
 
 
 def reduced_states(poses: Series, offset: float = 0.0) -> Floats:
-    """Return r = (x - offset [m], beta [rad], gamma [rad]), (N, 3), of poses (N, 7).
+    """Return r = (x - offset [m], beta [rad], gamma [rad]), (N, 3), for poses (N, 7).
 
     R = Rx(alpha) Ry(beta) Rz(gamma) has the first row (cos b cos g, -cos b sin g, sin b), so
     beta = asin(R13) and gamma = atan2(-R12, R11).
@@ -165,7 +165,7 @@ def estimate_error(run: Run, estimate: Series) -> tuple[Stamps, Floats]:
     run : Run
         The run, with its truth.
     estimate : Series
-        r by stamp, (N, 3): `run.reduced_state`, or that of a rerun.
+        Estimated r, (N, 3): `run.reduced_state`, or that of a rerun.
     """
     here, there = estimate.at(run.truth.stamps)
     error = estimate.values[here] - reduced_states(run.truth, target_offset(run))[there]
@@ -193,7 +193,7 @@ def reached_depth(run: Run) -> bool:
 
 
 def stop_cause(run: Run) -> str:
-    """Return why the insertion stopped: the first reason reported after the last steering.
+    """Return the cause of a stop of the insertion: the first reason reported after steering.
 
     Later reports, such as that of a disabled device, are consequences.
     """
@@ -221,7 +221,7 @@ def stop_cause(run: Run) -> str:
 
 def watchdog_trips(run: Run) -> int:
     """Return the number of watchdog trips of all nodes."""
-    # At level drive sim_rig publishes no device/status, and reports trips in /diagnostics.
+    # At level drive, sim_rig publishes no device/status and reports trips in /diagnostics.
     total = sum(event.part == "sim_rig: watchdogs" and event.level > 0 for event in run.health)
     for statuses in (run.controller_status, run.device_status):
         values = [s.values["watchdog_trips"] for s in statuses if "watchdog_trips" in s.values]
@@ -236,7 +236,7 @@ def is_aborted(result: Result) -> bool:
 
 
 def troubles(run: Run) -> list[HealthEvent]:
-    """Return all warnings and faults, tripped watchdogs and aborted steps, in order.
+    """Return all warnings, faults, watchdog trips and aborted steps, in order.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ def health_of(run: Run) -> list[HealthEvent]:
 
 
 def trips(run: Run) -> list[HealthEvent]:
-    """Return the trips of the watchdogs of controller and device, with the reported reason."""
+    """Return the watchdog trips of controller and device, with the reported reasons."""
     return [
         *_trips("plane_controller: watchdog", run.controller_status),
         *_trips("device: watchdog", run.device_status),

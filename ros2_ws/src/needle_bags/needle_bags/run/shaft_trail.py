@@ -7,21 +7,21 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Minimum distance of points along the path, in insertion depth [m].
+# Minimum distance between points of the path, in insertion depth [m].
 _SPACING = 1e-3
 # A needle withdrawn to this depth starts a new path [m].
 _OUT = 5e-4
 
 
 class ShaftTrail:
-    """Path of the tip during the insertion: the shaft follows it.
+    """Path of the tip during the insertion, which the shaft follows.
 
     The path starts at the entry point, the origin of `rig`.
 
     Parameters
     ----------
     start : ndarray, optional
-        The origin, if the path consists of poses, shape (4, 4), instead of positions.
+        Pose of the origin, shape (4, 4), for a path of poses; by default the path has positions.
     """
 
     def __init__(self, start: Array | None = None) -> None:
@@ -46,7 +46,7 @@ class ShaftTrail:
         insertion : float
             Insertion depth [m].
         position : ndarray, shape (3,)
-            The tip in `rig` [m].
+            Position of the tip in `rig` [m].
         """
         if insertion < _OUT:
             del self._insertions[1:], self._positions[1:]
@@ -62,7 +62,7 @@ class ShaftTrail:
         insertion : float
             Insertion depth [m]; a withdrawn needle retreats along its path.
         tip : ndarray, shape (3,)
-            In `rig` [m].
+            Position of the tip in `rig` [m].
 
         Returns
         -------

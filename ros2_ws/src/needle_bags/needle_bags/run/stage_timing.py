@@ -1,8 +1,8 @@
-"""Duration of each stage of a step or path, by the times at which its messages were sent.
+"""Duration of each stage of a step or path, from the send times of its messages.
 
 A driver cycle ends with its joint_states. The first joint_states after the status that reports a
-command belong to the first cycle with set-points from it. On a rig their stamp is the time of the
-SYNC after these set-points; in simulated time the end of the cycle is used.
+command belong to the first cycle with set-points from it. On a rig, their stamp is the time of the
+SYNC after these set-points; in simulated time, the end of the cycle is used instead.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from needle_bags.reading.bag_reader import Run
 Floats = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 
-# Published with each image, and faster to read.
+# Published with each image, but faster to read.
 _IMAGES = ("stereo/left/camera_info", "stereo/right/camera_info")
 _EXPOSURE = "sim/tip_pose"
 _TIP, _COMMAND, _RESULT = "needle/tip_pose", "device/joint_trajectory", "device/result"
 _JOINTS, _STATUS = "joint_states", "device/status"
-# An older stamp is in simulated time [ns].
+# A stamp older than this is in simulated time [ns].
 _FRESH = 1_000_000_000
 STAGES = (
     ("tracker", "both images to tip"),
@@ -45,9 +45,9 @@ class StageTiming:
     Attributes
     ----------
     name, meaning : str
-        Name, and its first and last event.
+        Name of the stage, and its first and last event.
     stamps : (N,) int64
-        Exposure at the start of the step [ns].
+        Time of exposure at the start of the step [ns].
     seconds : (N,) float64
         Wall time [s].
     """
@@ -68,7 +68,7 @@ def stage_timings(run: Run) -> list[StageTiming]:
     """
     sent = _first_sent(run)
     left, right = (sent[topic] for topic in _IMAGES)
-    # Free-running cameras have different stamps; a pair has that of the left image.
+    # Images of free-running cameras have different stamps; a pair has that of the left image.
     exposed = {stamp: max(time, right.get(stamp, time)) for stamp, time in left.items()}
     exposed = exposed or sent[_EXPOSURE]
     tips, commands, results = sent[_TIP], sent[_COMMAND], sent[_RESULT]
@@ -91,7 +91,7 @@ def stage_timings(run: Run) -> list[StageTiming]:
 
 
 def _first_sent(run: Run) -> dict[str, dict[int, int]]:
-    """Return the time of the first message by relative topic and stamp."""
+    """Return the send time of the first message, by relative topic and stamp [ns]."""
     topics = (*_IMAGES, _EXPOSURE, _TIP, _COMMAND, _RESULT, _JOINTS)
     names = {run.namespace + name: name for name in topics}
     sent: dict[str, dict[int, int]] = defaultdict(dict)
@@ -101,7 +101,7 @@ def _first_sent(run: Run) -> dict[str, dict[int, int]]:
 
 
 def _received_commands(run: Run) -> tuple[Times, Times]:
-    """Return the times of device statuses, (N,), and the latest command stamps in them."""
+    """Return the send times of device statuses, (N,), and the latest command stamps in them."""
     reported_at, latest_stamps = [], []
     status = run.namespace + _STATUS
     for sent, message in messages_as_sent(run.path, status.__eq__):
@@ -114,7 +114,7 @@ def _received_commands(run: Run) -> tuple[Times, Times]:
 def _set_points(
     commands: dict[int, int], received_commands: tuple[Times, Times], joints: dict[int, int]
 ) -> dict[int, int]:
-    """Return the time of the first set-points on the bus by command stamp [ns]."""
+    """Return the time of the first set-points on the bus, by command stamp [ns]."""
     reported_at, latest_stamps = received_commands
     cycles = sorted((sent, stamp) for stamp, sent in joints.items())
     ends = np.array([sent for sent, _ in cycles], np.int64)
@@ -135,7 +135,7 @@ def _between(begins: dict[int, int], ends: dict[int, int]) -> dict[int, int]:
 
 
 def _waits(begins: dict[int, int], ends: dict[int, int]) -> dict[int, int]:
-    """Return the delay from each message to the next of the others, by stamp [ns]."""
+    """Return the delay from each message to the next message in `ends`, by stamp [ns]."""
     times = np.sort(np.array(list(ends.values()), np.int64))
     waits = {}
     for stamp, time in begins.items():

@@ -41,7 +41,7 @@ from needle_core.status_messages import DeviceStatus
 HOLD, INPUT_DEVICE = "device/hold", "input device"
 DEVICE_STOP = "device/stop"
 RELEASES = 3
-"""The hold is best effort, so a final release is repeated."""
+"""Number of final release messages, as delivery of the hold is best effort."""
 
 
 class Operator(Component):
@@ -83,13 +83,13 @@ class Operator(Component):
             self.ports = (Port(INPUT_DEVICE, self._on_readings),)
 
     def on_settings(self, settings: OperatorParameters, at: Moment) -> Actions:
-        """Apply another speed."""
+        """Apply a changed speed."""
         self.settings = settings
         if self.ports:
             yield Send(INPUT_DEVICE, (settings.speed_scale,))
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note the controller's services and the number of joysticks."""
+        """Store the discovered services and joystick publishers."""
         self._peers = peers
         return ()
 

@@ -1,4 +1,4 @@
-"""Readings of an input device; a press is a hold only if it follows a release of all buttons."""
+"""Readings of an input device; only a press after a release of all buttons counts as a hold."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class InputLost:
     Attributes
     ----------
     reason : str
-        Why.
+        Reason why it is unavailable.
     """
 
     reason: str
@@ -69,9 +69,9 @@ class HoldDecision:
     stop : bool
         Whether a stop was just requested.
     trouble : str
-        Why there is no input; empty if there is.
+        Reason why there is no input; empty if there is input.
     ignored_press : bool
-        Whether a button is down that is ignored until all are released.
+        Whether a button is down but ignored until all buttons are released.
     """
 
     kind: HoldKind = HoldKind.NOTHING
@@ -82,11 +82,11 @@ class HoldDecision:
 
 
 class HoldDebouncer:
-    """Accepts a press that starts from neutral, as long as it lasts.
+    """Accepts a press that starts from neutral, for as long as it lasts.
 
     After the start, a loss of the input device, a stop, two buttons at once, or a suspension of
-    this process the controls must be neutral first: a button that was down meanwhile never becomes
-    a hold by itself.
+    this process, the controls must be neutral first, so that a button that stayed down never
+    becomes a hold by itself.
     """
 
     def __init__(self) -> None:

@@ -34,7 +34,7 @@ def eviocgabs(axis: int) -> int:
 
 
 class InputDevice:
-    """An open device file; no call blocks, and every call raises OSError if the device is gone.
+    """Open device file; no call blocks, and every call raises an OSError if the device is gone.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class InputDevice:
     Raises
     ------
     OSError
-        If it cannot be opened, or is no input device.
+        If it cannot be opened, or is not an input device.
     """
 
     def __init__(self, path: str) -> None:
@@ -58,7 +58,7 @@ class InputDevice:
             raise
 
     def read(self) -> bytes:
-        """Return the queued events as the kernel packs them: whole ones.
+        """Return the queued events, complete and as packed by the kernel.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class KeyChanges:
     Attributes
     ----------
     pressed, released : frozenset of int
-        Their codes; a key can be in both. Key repeat is in neither.
+        Codes of the keys; a key can be in both. Key repeats are in neither.
     dropped : bool
         Whether the kernel dropped events, so that the changes are incomplete.
     """
@@ -122,7 +122,7 @@ class KeyChanges:
 
 
 def key_changes(data: bytes) -> KeyChanges:
-    """Return the key changes in events as the kernel packs them."""
+    """Return the key changes in events as packed by the kernel."""
     changed: dict[int, set[int]] = {_PRESSED: set(), _RELEASED: set()}
     dropped = False
     for _, _, kind, code, value in EVENT.iter_unpack(data):

@@ -1,4 +1,4 @@
-"""Port of the operator on an input device of the kernel: a pedal, key or joystick."""
+"""Port between the operator and an input device of the kernel: a pedal, key or joystick."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ OPEN_PERIOD = 0.5
 
 
 class InputPort:
-    """The input device: read every `PERIOD`, when the component handles the event.
+    """Port that reads the input device every `PERIOD`, when the component handles the event.
 
-    A pedal that is held down sends no events, so the state of its key is queried. The events show
+    A pedal that is held down sends no events, so the state of its key is queried. The events reveal
     changes between two readings.
 
     Parameters
     ----------
     settings : OperatorParameters
-        The device, and the meaning of its keys and axes.
+        The device, and the assignment of its keys and axes.
     open_device : callable
-        Opens the device file; returns what has the methods of `InputDevice`.
+        Opens the device file; returns an object with the methods of `InputDevice`.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class InputPort:
         threading.Thread(target=self._request_readings, args=(arrive,), daemon=True).start()
 
     def send(self, batch: tuple[float, ...]) -> None:
-        """Set the speed at full axis, or without an axis, 0..1."""
+        """Set the speed at full deflection of the axis, or without an axis, 0..1."""
         self._speed = batch[-1]
 
     def close(self) -> None:
@@ -81,12 +81,12 @@ class InputPort:
             raise OSError(0, f"it has no key {missing[0]} (its keys: {present})")
 
     def _poll(self, device: InputDevice) -> InputState:
-        # Events first: a later change shows in the state of the keys, and in the next reading.
+        # Read the events first: later changes affect the key states, and the next reading.
         changes = key_changes(device.read())
         down, settings, speed = device.keys_down(), self._settings, self._speed
         if settings.speed_axis != NONE:
             speed *= settings.speed(device.axis(settings.speed_axis))
-        # A key is held if it is down, and has been down since the last reading.
+        # A key counts as held only if it was not released since the last reading.
         held = frozenset() if changes.dropped else down - changes.released
         return InputState(
             insert=settings.key in held,

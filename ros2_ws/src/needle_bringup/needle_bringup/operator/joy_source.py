@@ -1,4 +1,4 @@
-"""A joystick on a topic of sensor_msgs/Joy, which must be published continuously."""
+"""Joystick on a topic of type sensor_msgs/Joy, which must be published continuously."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from needle_bringup.operator.hold_debouncer import InputLost, InputReading, InputState
 from needle_bringup.operator.parameters import NONE, OperatorParameters
 
-# Without a message for this time the joystick is lost [s].
+# Without a message for this time, the joystick counts as lost [s].
 JOY_TIMEOUT = 0.1
 
 
@@ -18,7 +18,7 @@ class JoySource:
     Parameters
     ----------
     settings : OperatorParameters
-        Meaning of its buttons and axes.
+        Assignment of its buttons and axes.
     """
 
     def __init__(self, settings: OperatorParameters) -> None:
@@ -37,11 +37,11 @@ class JoySource:
         Parameters
         ----------
         axes, buttons : sequence
-            As in sensor_msgs/Joy.
+            Axes and buttons as in sensor_msgs/Joy.
         now : float
             Steady time of arrival [s].
         stamp : float
-            Time of sending by the sender's clock [s]; 0: unknown.
+            Time of sending on the sender's clock [s]; 0 if unknown.
         """
         overtaken = 0.0 < stamp < self._stamp
         if overtaken and now - self._arrival <= JOY_TIMEOUT:
@@ -56,7 +56,7 @@ class JoySource:
         now : float
             Steady time [s].
         speed : float
-            Speed at full axis, or without an axis, 0..1.
+            Speed at full deflection of the axis, or without an axis, 0..1.
         publishers : int
             Number of publishers of the topic; with several, none is used.
         """
@@ -73,7 +73,7 @@ class JoySource:
         return InputState(insert=insert, retract=retract, stop=stop, speed=speed)
 
     def _why_lost(self, now: float, publishers: int) -> str:
-        """Return why the last message is not valid; empty if it is."""
+        """Return the reason why the last message is invalid; empty if it is valid."""
         last, axis = max(self._settings.keys), self._settings.speed_axis
         has, axes = "the joystick's message has", len(self._axes)
         for why, wrong in (

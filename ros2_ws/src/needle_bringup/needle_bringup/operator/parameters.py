@@ -11,7 +11,7 @@ PERIOD = 0.02
 """Period of reading the controls [s]."""
 PEDAL, JOYSTICK, JOY = "pedal", "joystick", "joy"
 NONE = -1
-"""A key or axis that is not assigned."""
+"""Value of a key or axis that is not assigned."""
 _LAST_KEY, _LAST_AXIS = 0x2FF, 0x3F
 
 

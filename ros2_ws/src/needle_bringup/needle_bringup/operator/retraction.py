@@ -1,4 +1,4 @@
-"""Withdrawal of the needle with a held button: the required service calls in their order."""
+"""Withdrawal of the needle while a button is held: sequence of the required service calls."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ _TIMEOUT_TEXT = {
 class RetractionSequence:
     """State machine from the press of the button to its release.
 
-    A steering controller would answer the hold with a step forward, so it is stopped first. The
-    hold is pressed only during the withdrawal: a button that is still held when the needle is out
-    cannot insert it.
+    An active steering controller would respond to the hold with a step forward, so it is stopped
+    first. The hold is pressed only during the withdrawal, so that a button that is still held when
+    the needle is out cannot insert it.
 
     Parameters
     ----------

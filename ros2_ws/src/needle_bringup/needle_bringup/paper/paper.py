@@ -29,7 +29,7 @@ exit codes: 0 done; 2 invalid or missing input; 130 interrupted
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `paper`; returns its exit code."""
+    """Run `paper`; return its exit code."""
     return run_command(lambda: _paper(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -43,13 +43,13 @@ def _paper(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--json", metavar="FILE", help="also write the figures as flat JSON")
     given = parser.parse_args(arguments)
-    # The trials have the following seeds.
+    # The trials use consecutive seeds from this one on.
     seed = whole_number("--seed", given.seed, 0, 2**31 - 100)
     file = output_file("--json", given.json)
     root = checkout()
     out = make_folder("--out", given.out or str(root / OUT))
     make_folder("--out", str(out / IMAGES))
-    # These imports take a second; an invalid command line does not need them.
+    # Import late, because this takes a second and the command line may be invalid.
     from needle_bags.figures.figure_style import save  # noqa: PLC0415
     from needle_bringup.paper.paper_figures import figures_of  # noqa: PLC0415
     from needle_bringup.paper.paper_page import as_text, key_figures, page, table  # noqa: PLC0415

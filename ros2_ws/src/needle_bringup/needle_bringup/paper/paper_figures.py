@@ -46,7 +46,7 @@ def figures_of(results: PaperRuns) -> Mapping[str, Figure]:
 
 
 def figure_3(results: PaperRuns) -> Figure:
-    """Return three columns: open loop, closed loop, and a trial whose truth is not shown."""
+    """Draw three columns: open loop, closed loop, and a trial without its truth."""
     figure = Figure(figsize=(9.0, 7.6), layout="constrained")
     grid = figure.subplots(4, 3, sharex=True, squeeze=False)
     columns = (
@@ -76,7 +76,7 @@ def figure_3(results: PaperRuns) -> Figure:
 
 
 def figure_4(trials: list[SteeringTrial]) -> Figure:
-    """Return mean and standard deviation of r1 over the trials, and the trial of figure 3."""
+    """Draw mean and standard deviation of r1 over the trials, and the trial of figure 3."""
     figure = Figure(figsize=(6.6, 3.6), layout="constrained")
     axes = figure.add_subplot()
     insertion, r1 = common_r1(trials)
@@ -92,7 +92,7 @@ def figure_4(trials: list[SteeringTrial]) -> Figure:
 
 
 def study_figure(results: PaperRuns) -> Figure:
-    """Return the final distances of the runs of the study, at its depth and farther in."""
+    """Draw the distances of the study's runs from the plane, at the study's depth and deeper."""
     figure = Figure(figsize=(8.4, 3.4), layout="constrained")
     share, later = figure.subplots(1, 2)
     for grid, color in (("endpoint", MEAN), ("cell", ESTIMATE)):
@@ -126,7 +126,7 @@ def study_figure(results: PaperRuns) -> Figure:
 
 
 def domain_figure(results: PaperRuns) -> Figure:
-    """Return the share of converging runs over the start."""
+    """Draw the share of converging runs over the initial state."""
     figure = Figure(figsize=(8.4, 3.8), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     image: Any = None

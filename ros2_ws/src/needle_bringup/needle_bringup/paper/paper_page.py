@@ -1,4 +1,4 @@
-"""The page `docs/paper.md`: values of the paper and of this project, and the figures."""
+"""The page `docs/paper.md`: values from the paper and from this project, and the figures."""
 
 from __future__ import annotations
 

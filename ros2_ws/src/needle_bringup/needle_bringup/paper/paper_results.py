@@ -1,4 +1,4 @@
-"""Trials and studies of [KC09] section IV: their runs, as commands, and their results."""
+"""Trials and studies of [KC09] section IV, run as commands, and their results."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _SUMMARY = "summary.json"
 
 
 class Laboratory:
-    """Runs trials and studies, each once.
+    """Runner of trials and studies that runs each of them once.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Laboratory:
         self._folder = folder
 
     def trial(self, name: str, *arguments: str) -> Run:
-        """Run a trial and read its bag; a missed plane is no error.
+        """Run a trial and read its bag; missing the plane is not an error.
 
         Raises
         ------
@@ -65,7 +65,7 @@ class Laboratory:
         """
         bag = self._folder / name
         if not (bag / _SUMMARY).is_file():
-            shutil.rmtree(bag, ignore_errors=True)  # of an earlier, failed run
+            shutil.rmtree(bag, ignore_errors=True)  # left by a failed run
             command = [*self._simulate, *arguments, "--bag", str(bag)]
             _run(name, command, (EXIT_DONE, EXIT_MISSED))
         return read_run(bag)
@@ -112,11 +112,11 @@ class SteeringTrial:
     Attributes
     ----------
     insertion_mm : ndarray, shape (N,)
-        At each exposure.
+        Insertion depth at each exposure.
     measured_mm, estimate, truth : ndarray, shapes (N,), (N, 3), (N, 3)
-        r1 as measured; r = (x [mm], pitch [deg], roll [deg]) as estimated and as it was.
+        Measured r1; estimated and true r = (x [mm], pitch [deg], roll [deg]).
     rotation_deg : ndarray, shape (N,)
-        Accumulated rotation of the base.
+        Accumulated rotation of the base at each exposure.
     """
 
     insertion_mm: Floats
@@ -136,31 +136,31 @@ class PaperRuns:
     seed : int
         Seed of all noise.
     quick : bool
-        Fewer trials, and one draw instead of ten.
+        Whether to run fewer trials, and one draw instead of ten.
 
     Attributes
     ----------
     open_loop, closed_loop : SteeringTrial
         The first two columns of figure 3.
     trials : list of SteeringTrial
-        Figure 4; the first is the third column of figure 3.
+        Trials of figure 4; the first is the third column of figure 3.
     start : dict
-        Figures of many runs from figure 3's start.
+        Figures of many runs from the start of figure 3.
     grids : dict
-        Of the study on each grid, by its name.
+        Figures of the study on each grid, by name of the grid.
     runs, longer : dict
-        Single runs of those studies, and the same runs inserted farther.
+        Single runs of those studies, and the same runs inserted deeper.
     scales, scales_longer : dict
-        Figures of the study with the curvature wrong, by the plant's multiple of the assumed one;
-        at the study's depth and farther in.
+        Figures of the study with a wrong curvature, by the ratio of the plant's curvature to the
+        assumed one, at the study's depth and deeper.
     domain_pitch, domain_roll : mapping
         Single runs from starts over (x, pitch) and over (x, roll).
     best : dict
         Figures of preset `best` on the endpoint grid.
     curvature : dict
-        What `identify_curvature` finds in a pure insertion by cameras.
+        Result of `identify_curvature` for a pure insertion with cameras.
     curvature_errors : CurvatureErrors
-        What many pure insertions with the paper's noise give.
+        Errors of the curvature over many pure insertions with the paper's noise.
     """
 
     def __init__(self, laboratory: Laboratory, seed: int, *, quick: bool) -> None:
@@ -205,7 +205,7 @@ class PaperRuns:
             self.scales_longer[scale], _ = study(f"scale_{scale:g}_longer", *wrong, *far)
         self.start, _ = study("start", *at, f"--initial={INITIAL}", "--noise-mm", "0.5")
         self.best, _ = study("best", "--controller", "best", "--seed", str(seed), *draws)
-        # Before the needle is visible the tracker reports predictions.
+        # Skip the first 5 mm, where the needle is not visible and the tracker reports predictions.
         self.curvature = laboratory.identify("curvature", "pure_insertion", "--from-mm", "5")
         many = 300 if quick else 3000
         self.curvature_errors = curvature_errors(many, np.random.default_rng(seed))
@@ -233,7 +233,7 @@ def final_r1_mm(trial: SteeringTrial) -> float:
 
 
 def settled_mm(insertion_mm: Floats, r1_mm: Floats) -> float:
-    """Return the insertion of the last entry into +-1 mm [mm]; infinite if it ends outside."""
+    """Return the insertion from which r1 stays within +-1 mm [mm]; infinite if it never does."""
     outside = np.flatnonzero(np.abs(r1_mm) > GOAL_MM)
     if outside.size == 0:
         return float(insertion_mm[0])
@@ -242,12 +242,12 @@ def settled_mm(insertion_mm: Floats, r1_mm: Floats) -> float:
 
 
 def missed_later(runs: Columns, longer: Columns) -> tuple[int, int, float]:
-    """Return how many runs missed at 120 mm and at the greater depth, and the worst distance there.
+    """Count the runs that missed at 120 mm and also at the greater depth; find the worst of them.
 
     Returns
     -------
     missed, still : int
-        At 120 mm, and at both depths.
+        Number of runs that missed at 120 mm, and of those that missed at both depths.
     worst : float
         Largest |r1| [mm] at the greater depth among the runs that had missed; 0 if none had.
     """

@@ -27,15 +27,15 @@ def describe(
     Parameters
     ----------
     arguments : mapping
-        Launch argument, besides `namespace`, to its default and description. A misspelt argument
-        ends the launch.
+        Launch arguments in addition to `namespace`, with default and description. A misspelt
+        argument ends the launch.
     nodes : callable
-        Takes launch argument -> text, returns node -> parameter -> value; an exception ends the
-        launch before a node is started.
+        Maps launch argument -> text to node -> parameter -> value; an exception ends the launch
+        before a node is started.
     choices : mapping
-        Argument to its allowed values.
+        Allowed values by argument.
     words : callable
-        Takes launch argument -> text, returns node -> further command line arguments.
+        Maps launch argument -> text to node -> further command line arguments.
     """
     every = {**arguments, "namespace": ("", "namespace of all nodes")}
 

@@ -29,7 +29,7 @@ Calls       device/stop, device/retract, plane_controller/stop
 
 
 def main(open_device: Callable[[str], Any] = InputDevice) -> int:
-    """Run the operator; returns its exit code."""
+    """Run the operator; return its exit code."""
 
     def ports(settings: OperatorParameters) -> Mapping[str, RealPort]:
         return {} if settings.source == JOY else {INPUT_DEVICE: InputPort(settings, open_device)}

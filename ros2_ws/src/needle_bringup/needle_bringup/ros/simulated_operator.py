@@ -37,7 +37,7 @@ invalid; 130 interrupted
 
 
 class _ProgressPort:
-    """Shows the progress at the terminal."""
+    """Port that shows the progress in the terminal."""
 
     def __init__(self) -> None:
         self._progress = Progress(_progress_stream())
@@ -62,7 +62,7 @@ def _progress_stream() -> TextIO:
 
 
 def main() -> int:
-    """Run the node; returns its exit code."""
+    """Run the node; return its exit code."""
     return run_component(
         "simulated_operator",
         SimulatedOperatorParameters,

@@ -37,7 +37,7 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 HOLD, PROGRESS = "device/hold", "progress"
 RECORDER, PARAMETERS_OF = "recorder", "parameters_of"
 _CONTROLLER, _DEVICE = "needle/controller_status", "device/status"
-# The hold is best effort, so a final release is repeated.
+# Number of final release messages, as delivery of the hold is best effort.
 _RELEASES = 3
 
 
@@ -78,7 +78,7 @@ class SimulatedOperatorParameters:
 
 
 class SimulatedOperator(Component):
-    """Executes an `OperatorSequence`.
+    """Component that executes an `OperatorSequence`.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class SimulatedOperator(Component):
         self.timers = (Timer(1.0 / settings.hold_rate, self._on_timer),)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note the missing partners."""
+        """Update the list of missing nodes and services."""
         self._sequence.handle_devices(peers.publishers.get(_DEVICE, ()))
         missing = [
             f"service {call.service}" for call in PREPARATION if call.service not in peers.services
@@ -147,7 +147,7 @@ class SimulatedOperator(Component):
         self._sequence.interrupt()
         outcome = self._sequence.outcome
         if self._is_finished and outcome is not None:
-            # The other nodes end on the same signal and do not answer.
+            # The signal also ends the other nodes, so they do not answer.
             return (Exit(EXIT_INTERRUPTED, outcome.text),)
         return self._advance(at)
 
@@ -162,7 +162,7 @@ class SimulatedOperator(Component):
         return self._advance(at)
 
     def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
-        """Note the nodes whose parameters are not in the bag yet; a rerun needs them."""
+        """Update the nodes whose parameters are not in the bag yet; a rerun needs them."""
         for status in message.statuses:
             if status.part == PARAMETERS_OF and status.source.rpartition("/")[2] == RECORDER:
                 recorded = {name.lstrip("/") for name in status.text.split(", ")}
@@ -172,7 +172,7 @@ class SimulatedOperator(Component):
         return ()
 
     def _on_timer(self, at: Moment) -> Actions:
-        # Also while released: the device accepts a press only after a release.
+        # Publish releases as well: the device accepts a press only after a release.
         if self._sequence.may_act and not self._is_finished:
             yield self._hold(at, pressed=self._sequence.hold())
         self._sequence.check_time(at.steady)

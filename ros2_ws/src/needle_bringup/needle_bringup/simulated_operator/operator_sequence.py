@@ -14,13 +14,13 @@ ENABLE = Call("device/enable", True)
 START = Call("plane_controller/start")
 PREPARATION = (Call("device/confirm_needle_out", True), HOME, ENABLE, START)
 DISABLE = Call("device/enable", False)
-# Start of the refusal of a node that has not discovered all partners; the call is repeated.
+# Prefix of the refusal by a node that has not discovered all partners; the call is repeated.
 NOT_YET = "waiting for"
 RETRY_AFTER = 0.1
-# An answer can be lost for good: a server that has not discovered the client yet drops it without
-# notice. An unanswered call is repeated after this time [s].
+# An unanswered call is repeated after this time [s]. An answer can be lost: a server that has not
+# discovered the client yet drops it silently.
 CALL_TIMEOUT = 1.0
-# Answer of device/home when homing has started; with any other there is nothing to wait for.
+# Answer of device/home when homing has started; after any other there is nothing to wait for.
 HOMING = "homing"
 # Other refusals may be due to delayed messages, so they are repeated for this time [s].
 REFUSAL_TIMEOUT = 2.0
@@ -30,12 +30,12 @@ _PROGRESS = ("state", "step", "insertion_m")
 
 
 class OperatorSequence:
-    """Prepares the rig, presses the hold while it steers, and ends with an outcome.
+    """State machine that prepares the rig, presses the hold during steering, and has an outcome.
 
     Unanswered calls are repeated. Confirming and enabling are idempotent; homing and start are only
     repeated if the statuses do not show that they were accepted.
 
-    All times are steady times [s].
+    All times are monotonic times [s].
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class OperatorSequence:
         self._pending = False
         if success:
             if message == HOMING:
-                # An earlier status does not refer to this homing.
+                # Statuses from before the call do not refer to this homing.
                 self._homed = self._homed_since_call
             self._advance(now)
             return
@@ -185,7 +185,7 @@ class OperatorSequence:
         self._starts = status.starts or 0
         started = self._starts > self._starts_before
         if self._called(START) and started:
-            # The answer may be late or lost.
+            # Do not wait for the answer, which may be late or lost.
             self._advance(now)
         before, self._controller = self._controller, status
         if any(getattr(status, name) != getattr(before, name) for name in _PROGRESS):
@@ -204,11 +204,11 @@ class OperatorSequence:
             self._end(f"plane_controller stopped: {why}")
 
     def _called(self, call: Call) -> bool:
-        """Return whether `call` was made and its success is not known yet."""
+        """Return whether `call` was made and has not succeeded yet."""
         return self.outcome is None and self._asked and PREPARATION[self._prepared] == call
 
     def interrupt(self) -> None:
-        """Handle a signal to end."""
+        """Handle a signal that ends the process."""
         if self.outcome is None:
             self.outcome = Exit(EXIT_INTERRUPTED, "interrupted")
 
@@ -235,7 +235,7 @@ class OperatorSequence:
         return self._simulated and list(self._devices) == [self._device_source]
 
     def pending_reason(self) -> str:
-        """Return what the preparation waits for."""
+        """Return the reason why the preparation does not continue."""
         call = PREPARATION[self._prepared].service
         if self._missing:
             return "missing " + ", ".join(self._missing)

@@ -13,7 +13,7 @@ PROGRESS_FD = "NEEDLE_PROGRESS_FD"
 
 
 class Progress:
-    """A progress bar on a terminal, otherwise a line for every quarter.
+    """Progress bar on a terminal, otherwise a line for every quarter of the insertion.
 
     Parameters
     ----------

@@ -90,7 +90,7 @@ class ConsoleOptions:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `console`; returns its exit code."""
+    """Run `console`; return its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
     return run_command(lambda: console(parse_console(words)))
 
@@ -135,12 +135,12 @@ def console(options: ConsoleOptions) -> int:
     Returns
     -------
     int
-        130 after a signal, 1 if a component ended before.
+        130 after a signal, 1 if a component ended earlier.
 
     Raises
     ------
     UserError
-        If something is missing, a port is in use, or a node ended.
+        If a file or package is missing, a port is in use, or a node ended.
     """
     with ShutdownFlag() as end:
         run = run_nodes if options.rig.graph else _run_components
@@ -155,7 +155,7 @@ def rig_parameters(options: ConsoleOptions) -> Parameters:
 
 
 def _run_components(options: ConsoleOptions, parameters: Parameters, end: ShutdownFlag) -> int:
-    # One thread per process: the matrices are small. numpy reads this when it is loaded.
+    # One thread per process, because the matrices are small; numpy reads this when it is loaded.
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
     from needle_console.console import PAGE, Console  # noqa: PLC0415
     from needle_console.console_parameters import ConsoleParameters  # noqa: PLC0415
@@ -203,9 +203,9 @@ def run_nodes(options: ConsoleOptions, rig: Parameters, end: ShutdownFlag) -> in
     options : ConsoleOptions
         Options of the command line.
     rig : Parameters
-        Node to its parameters.
+        Parameters by node.
     end : ShutdownFlag
-        Ends the run.
+        Flag that ends the run.
 
     Returns
     -------
@@ -215,7 +215,7 @@ def run_nodes(options: ConsoleOptions, rig: Parameters, end: ShutdownFlag) -> in
     Raises
     ------
     NodeFailedError
-        If a node ended before.
+        If a node ended earlier.
     """
     from needle_bringup.simulation.launch_nodes import LAUNCHED_PACKAGES  # noqa: PLC0415
     from needle_bringup.simulation.node_graph import NodeGraph, wait_for  # noqa: PLC0415

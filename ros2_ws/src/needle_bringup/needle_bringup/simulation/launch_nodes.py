@@ -25,7 +25,7 @@ LAUNCHED_PACKAGES = {
     "live_view": "needle_bags",
 }
 """Package of each node in a launch file."""
-# Topics of the live view that the player publishes under /replay only.
+# Topics of the live view that the player publishes only under /replay.
 _NOT_FOR_RIGS = ("target_plane", "target_point")
 
 # Parameter that a file must not set -> its launch argument.
@@ -56,7 +56,7 @@ def refuse_misspelt(given: Iterable[str], declared: Sequence[str]) -> None:
     Raises
     ------
     UserError
-        Names the argument, and the similar one.
+        If an argument is misspelt; the message names it and the similar one.
     """
     for name in given:
         meant = difflib.get_close_matches(name.lower(), declared, n=1, cutoff=_CLOSE)
@@ -65,7 +65,7 @@ def refuse_misspelt(given: Iterable[str], declared: Sequence[str]) -> None:
 
 
 def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
-    """Return the nodes of simulation.launch.py: those of `simulate`, with the same parameters.
+    """Return the nodes of simulation.launch.py, which are those of `simulate --graph`.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
     if arguments["registration"]:
         parameters["tracked_tip"] = {"registration_file": file}
     else:
-        # Best effort receives cameras of either reliability.
+        # A best-effort subscription matches cameras of either reliability.
         parameters["stereo_tracker"] = {"calibration_file": file, "reliable_images": False}
     if bag is not None:
         parameters["recorder"] = {"bag": str(bag), "run_info": json.dumps(dict(arguments))}
@@ -146,7 +146,7 @@ def replayed_nodes(arguments: Mapping[str, str]) -> Parameters:
     Returns
     -------
     dict
-        Node -> parameter -> value: none.
+        Node -> parameter -> value; no parameters are set.
 
     Raises
     ------

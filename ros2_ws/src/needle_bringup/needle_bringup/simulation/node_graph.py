@@ -1,4 +1,4 @@
-"""The rig as ROS nodes, one process each: started, monitored, and ended in order."""
+"""The rig as ROS nodes, one process each, which are started, monitored and ended in order."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 class NodeProcess:
-    """A process in its own session; it ends with its parent, even if that is killed.
+    """Process in its own session that ends with its parent, even if the parent is killed.
 
     Parameters
     ----------
@@ -40,11 +40,11 @@ class NodeProcess:
     command : sequence of str
         The command line.
     environment : mapping
-        Its whole environment.
+        Complete environment of the process.
     log : Path
         File for its output.
     pass_fds : sequence of int
-        Open files that it inherits.
+        File descriptors that it inherits.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class NodeProcess:
 
     @property
     def last_line(self) -> str:
-        """Last line of its output that is not empty."""
+        """Last non-empty line of its output."""
         lines = [line.strip() for line in self.tail(20) if line.strip()]
         return lines[-1] if lines else ""
 
@@ -98,7 +98,7 @@ class NodeProcess:
         return self.log.read_text(encoding="utf-8", errors="replace").splitlines()[-count:]
 
     def describe_end(self) -> str:
-        """Return how it ended, as text."""
+        """Describe how the process ended."""
         code = self.exit_code
         if code is None:
             return f"{self.name} runs"
@@ -107,7 +107,7 @@ class NodeProcess:
         return f"{self.name} ended with {how}" + (f": {text}" if text else "")
 
     def signal_group(self, number: signal.Signals) -> None:
-        """Send a signal to the process and its descendants."""
+        """Send a signal to the process group."""
         try:
             os.killpg(self._process.pid, number)
         except ProcessLookupError:
@@ -149,14 +149,14 @@ def stop(processes: Iterable[NodeProcess], grace: float = INTERRUPT_GRACE) -> li
         process.signal_group(signal.SIGTERM)
     stubborn = wait_for(running, TERMINATE_GRACE)
     for process in started:
-        # A process that has ended may have left others in its group.
+        # A process that has ended may have left child processes in its group.
         process.signal_group(signal.SIGKILL)
     wait_for(stubborn, TERMINATE_GRACE)
     return [f"{process.name} did not end on SIGINT and SIGTERM, killed" for process in stubborn]
 
 
 class NodeFailedError(UserError):
-    """A node ended too early.
+    """Premature end of a node.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class NodeGraph:
     folder : Path
         Folder for their parameters and logs.
     parameters : Parameters
-        Node to its parameters, of all nodes to be started.
+        Parameters of all nodes to be started, by node.
     variables : str
         Environment variables of the nodes, in addition to those of this process.
 
@@ -194,7 +194,7 @@ class NodeGraph:
         self._environment = {
             **os.environ,
             "PYTHONUNBUFFERED": "1",
-            # One thread per node: the matrices are small.
+            # One thread per node, because the matrices are small.
             "OPENBLAS_NUM_THREADS": "1",
             "OMP_NUM_THREADS": "1",
             **variables,

@@ -19,7 +19,7 @@ from needle_core.settings.parameter_fields import specs
 from needle_core.settings.parameter_files import Parameters
 from needle_device_driver.supervisor.limits import SafetyLimits
 
-# Node -> its package, in the order of starting.
+# Node -> its package, in the order in which the nodes are started.
 PACKAGES = {
     "recorder": "needle_bags",
     "sim_rig": "needle_sim",
@@ -30,7 +30,7 @@ PACKAGES = {
     "simulated_operator": "needle_bringup",
 }
 NODES = tuple(PACKAGES)
-# Nodes of some levels only -> these levels.
+# Nodes that exist only at some levels -> these levels.
 _LEVELS = {
     "drive_emulator": ("drive",),
     "device_driver": ("drive",),
@@ -39,10 +39,10 @@ _LEVELS = {
 
 CONTINUOUS_CAMERA_RATE = 30.0
 """Camera rate of a continuous insertion [Hz]."""
-# Minimum noise bound for the design of the controllers [m].
+# Minimum noise bound assumed by the controllers [m].
 SMALLEST_NOISE = 1e-5
 
-# Parameter that simulate sets -> its option.
+# Parameter that `simulate` sets -> its option.
 _ALIKE = ("level", "seed", "bag", "estimator", "law", "planner", "insertion", "obstacles")
 OPTIONS = {
     **{name: f"--{name}" for name in _ALIKE},
@@ -59,7 +59,7 @@ OPTIONS = {
     "target_point": "--target",
 }
 
-# Watchdog of driver and drives if seven processes share the cores [s].
+# Watchdog time of driver and drives when seven processes share the cores [s].
 GRAPH_WATCHDOG = 0.5
 
 # Parameters of the recorder that make the bag incomplete.
@@ -77,18 +77,18 @@ _GATES = {("sim_rig", "curvature"): ("stereo_tracker", "max_curvature", 9.0)}
 
 
 class Shared(NamedTuple):
-    """A value that several nodes must share.
+    """Value that several nodes must share.
 
     Attributes
     ----------
     what, option : str
-        Its name, and the option of simulate that sets it in all nodes.
+        Its name, and the option of `simulate` that sets it in all nodes.
     default : float or str
         Default of every node.
     unit : str
         Unit.
     places : dict of str to str
-        Node to its parameter.
+        Name of the parameter in each node.
     """
 
     what: str
@@ -137,7 +137,7 @@ def nodes_of(options: SimulateOptions) -> tuple[str, ...]:
 def command_line_parameters(
     options: SimulateOptions, bag: Path, command: str | None = None
 ) -> Parameters:
-    """Return the parameters that the command line sets, of the nodes of the run.
+    """Return the parameters that the command line sets in the nodes of the run.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def command_line_parameters(
     if options.obstacles is not None:
         parameters["plane_controller"]["obstacles"] = _obstacles(options.obstacles)
     if options.noise_mm is not None:
-        # The controllers know the noise bound of the sensor.
+        # Pass the sensor's noise bound to the controller.
         bound = max(options.noise_mm * 1e-3, SMALLEST_NOISE)
         parameters["plane_controller"]["tip_covariance"] = "configured"
         parameters["plane_controller"]["tip_noise"] = "bounded"
@@ -207,7 +207,7 @@ def command_line_parameters(
 
 
 def _of_drives(options: SimulateOptions) -> Parameters:
-    """Return the parameters of driver and drives that depend on the kind of the drives."""
+    """Return the parameters of driver and drives that depend on the type of the drives."""
     if options.drives == CIA402:
         return {}
     names = options.drives.split(",")
@@ -215,7 +215,7 @@ def _of_drives(options: SimulateOptions) -> Parameters:
     emulator: dict[str, Any] = {"drives": options.drives}
     driver: dict[str, Any] = {f"{axis}_drive": kind for axis, kind in kinds.items()}
     if options.graph:
-        # Below the ports that the system gives to connections.
+        # Stay below the ports that the system assigns to outgoing connections.
         port = emulator["listen"] = 12_000 + 2 * (os.getpid() % 10_000)
         for index, kind in enumerate(dict.fromkeys(names)):
             if kind != CIA402:
@@ -225,14 +225,14 @@ def _of_drives(options: SimulateOptions) -> Parameters:
 
 def _obstacles(path: Path) -> list[float]:
     """Return the obstacles of a file as plane_controller's parameter."""
-    # Importing compiled code takes half a second.
+    # Import late, because compiled code takes half a second to import.
     from needle_controller.planning.obstacles import read_obstacles  # noqa: PLC0415
 
     return [float(value) for value in read_obstacles(path).table.ravel()]
 
 
 def can_adapter() -> Path:
-    """Return the path of this process' emulated CAN adapter."""
+    """Return the path of this process's emulated CAN adapter."""
     return Path(tempfile.gettempdir()) / f"needle_can_{os.getpid()}"
 
 
@@ -242,7 +242,7 @@ def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> 
     Raises
     ------
     UserError
-        If the file sets the parameter of an option, or makes the recording incomplete.
+        If the file sets a parameter that an option sets, or makes the recording incomplete.
     """
     reserved = command_line_parameters(options, Path())
     for node, values in given.items():
@@ -279,11 +279,11 @@ def needle_parameters(
     Parameters
     ----------
     curvature : float or None
-        Curvature of its path [1/m].
+        Curvature of the needle's path [1/m].
     diameter : float or None
-        Diameter [m].
+        Diameter of the needle [m].
     pre_bend : float or None
-        Angle between shaft and pre-bent end [rad]; the lean is the same share of it as in [KC09].
+        Angle between shaft and pre-bent end [rad]; its ratio to the lean is that of [KC09].
     """
     sim_rig: dict[str, Any] = {}
     tracker: dict[str, Any] = {}

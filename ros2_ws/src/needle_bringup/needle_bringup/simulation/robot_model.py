@@ -33,12 +33,12 @@ examples:
 exit codes: 0 written, or no difference; 1 URDF, calibration and parameters differ; 2 invalid or
 missing input; 130 interrupted
 """
-# Largest difference of a number [m or rad], and that of a large one as a share of it.
+# Absolute [m or rad] and relative tolerance of a number.
 _DISTANCE, _SHARE = 1e-4, 1e-4
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line; return the exit code."""
     return run_command(lambda: robot_model(_parser().parse_args(arguments)))
 
 
@@ -53,7 +53,7 @@ def _parser() -> CommandParser:
 
 
 def robot_model(options: Namespace) -> int:
-    """Write or check the URDF, and print what differs; returns the exit code.
+    """Write or check the URDF, and print the differences; return the exit code.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def robot_model(options: Namespace) -> int:
 
 
 def _settings(parameters: Parameters) -> LiveViewParameters:
-    """Return the parameters of the model, from those of any node that shares them."""
+    """Return the parameters of the model, taken from any node that shares them."""
     own = LiveView.name
     values = {
         shared.places[own]: parameters[node][name]
@@ -92,7 +92,7 @@ def _settings(parameters: Parameters) -> LiveViewParameters:
 
 
 def differences(model: Mapping[str, str], given: Mapping[str, str]) -> list[str]:
-    """Return a line for each attribute of a joint that differs from the model's.
+    """Return a line for each joint attribute that differs from the model's.
 
     Parameters
     ----------

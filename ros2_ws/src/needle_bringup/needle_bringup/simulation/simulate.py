@@ -49,12 +49,12 @@ METADATA = "metadata.yaml"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 POLL = 0.05
-# Environment variable of scripts/simulate: start of the command, seconds since the epoch.
+# Environment variable set by scripts/simulate: start of the command, seconds since the epoch.
 STARTED_AT = "NEEDLE_STARTED_AT"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `simulate`; returns its exit code."""
+    """Run `simulate`; return its exit code."""
     if STARTED_AT in os.environ:
         _end_with_parent()
     words = sys.argv[1:] if arguments is None else arguments
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def simulate(options: SimulateOptions) -> int:
-    """Run one simulation as asked.
+    """Run one simulation with the given options.
 
     Parameters
     ----------
@@ -72,14 +72,14 @@ def simulate(options: SimulateOptions) -> int:
     Returns
     -------
     int
-        0 converged, 1 ran but missed.
+        0 if the needle converged, 1 if it missed.
 
     Raises
     ------
     UserError
-        If something is broken or missing.
+        If an input is invalid or missing, or a node failed.
     KeyboardInterrupt
-        After an interrupt and the end of all parts.
+        After an interrupt, when all parts have ended.
     """
     if options.graph:
         clean_environment(own_graph=True)
@@ -88,7 +88,7 @@ def simulate(options: SimulateOptions) -> int:
     if options.params is not None:
         given = read_parameters(options.params, nodes_of(options))
         refuse_reserved(options.params, given, options)
-    # From here on a signal is checked between steps; during the report it raises immediately.
+    # From here on, signals are checked between steps; during the report they raise immediately.
     end = ShutdownFlag()
     bag = _make_folder(options)
     try:
@@ -105,7 +105,7 @@ def simulate(options: SimulateOptions) -> int:
         _check(end)
         return _report(options, bag, started_at)
     except NodeFailedError as error:
-        # Keep the logs of a node that broke.
+        # Keep the logs if a node failed.
         if error.is_bad_input:
             shutil.rmtree(bag, ignore_errors=True)
         raise
@@ -124,7 +124,7 @@ def _run_components(
     options: SimulateOptions, parameters: Parameters, bag: Path, end: ShutdownFlag
 ) -> None:
     """Run the rig in this process until the operator ends."""
-    # Loading compiled code takes a while; with --graph the nodes do it.
+    # Import late: compiled code loads slowly, and with --graph only the nodes need it.
     from needle_bringup.simulation import virtual_run  # noqa: PLC0415
 
     components = virtual_run.make_components(parameters)
@@ -146,7 +146,7 @@ def _run_graph(
     """Run the rig as ROS nodes until the operator ends."""
     with reserve_domain_id() as domain:
         print(f"recording into {shown(bag)} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
-        # The nodes write log files; only the progress of the operator goes to the terminal.
+        # The nodes write log files; only the operator's progress is shown in the terminal.
         progress = os.dup(sys.stderr.fileno())
         variables = {"ROS_DOMAIN_ID": str(domain), PROGRESS_FD: str(progress)}
         graph = NodeGraph(bag, parameters, **variables)
@@ -173,7 +173,7 @@ def _await_operator(graph: NodeGraph, end: ShutdownFlag) -> None:
 
 def _report(options: SimulateOptions, bag: Path, started_at: float) -> int:
     """Write summary and report of the bag; return the exit code."""
-    # These imports take a second.
+    # Import late, because these imports take a second.
     from needle_bags.reading.bag_reader import read_run  # noqa: PLC0415
     from needle_bags.report.report import write_report  # noqa: PLC0415
     from needle_bags.run.run_summary import summarize  # noqa: PLC0415
@@ -190,7 +190,7 @@ def _report(options: SimulateOptions, bag: Path, started_at: float) -> int:
 
 
 def shown(path: Path) -> Path:
-    """Return a path, relative if it is below the current folder."""
+    """Return a path relative to the current folder if it is below it."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
@@ -200,7 +200,7 @@ def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
     Parameters
     ----------
     summary : mapping
-        The content of summary.json.
+        Content of summary.json.
     bag : Path
         The run's folder.
     """
@@ -263,7 +263,7 @@ def _checkout() -> Path:
 
 
 def _end_with_parent() -> None:
-    """Receive SIGTERM when scripts/simulate is killed."""
+    """Request SIGTERM for this process when scripts/simulate is killed."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)
     if os.getppid() == 1:

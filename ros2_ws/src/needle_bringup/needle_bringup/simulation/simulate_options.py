@@ -62,12 +62,12 @@ missing input; 130 interrupted
 
 LEVELS = ("tip", "camera", "drive")
 CIA402 = "cia402"
-# Presets and insertion modes of plane_controller, whose import takes half a second.
+# Presets and insertion modes of plane_controller, repeated because its import takes half a second.
 CONTROLLERS = ("best", "paper", "open_loop")
 INSERTIONS = ("stepwise", "continuous")
 
 DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
-# Options that command_of() omits, or writes in a special form.
+# Options that command_of() omits or formats specially.
 _SPECIAL = (
     *("bag", "json", "level", "controller", "seed", "target_mm", "graph", "component"),
     *("initial_x_mm", "initial_pitch_deg", "initial_roll_deg"),
@@ -352,7 +352,7 @@ def _new_bag(text: str | None) -> Path | None:
     if text is None:
         return None
     path = Path(text).expanduser()
-    # A dangling link is in the way as well.
+    # A dangling link also prevents the folder from being created.
     if path.exists() or path.is_symlink():
         raise UserError(f"--bag {text}: exists already; give a new folder")
     return path.absolute()

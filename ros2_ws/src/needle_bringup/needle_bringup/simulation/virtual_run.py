@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from needle_tracker.stereo_tracker import StereoTipTracker
 
 _FOLLOWING, _SEARCH = (0.03, 0.05), (0.3, 0.9)
-"""Compute time of the tracker for a pair with and without a tip, on two shared cores [s]."""
+"""Compute time of the tracker for an image pair with and without a tip, on two shared cores [s]."""
 _SLICE = 1.0
 _END_TIMEOUT = 5.0
 """Time for the rig to end after the operator [s]."""
@@ -47,14 +47,14 @@ _OF_ADAPTER = ("pty",)
 
 
 def make_components(parameters: Parameters) -> list[Component]:
-    """Return the rig of a level with its simulated operator; errors as of `make_rig`."""
+    """Return the rig of a level with its simulated operator; errors are those of `make_rig`."""
     operator = settings_of(SimulatedOperatorParameters, parameters, "simulated_operator")
     return [*make_rig(parameters), SimulatedOperator(operator)]
 
 
 def make_tracker(parameters: Parameters) -> StereoTipTracker:
     """Return the tracker."""
-    # Imports OpenCV, which a run without images does not need.
+    # Import late, because a run without images does not need OpenCV.
     from needle_tracker import stereo_tracker  # noqa: PLC0415
     from needle_tracker.tracker_parameters import StereoTrackerParameters  # noqa: PLC0415
 
@@ -72,9 +72,9 @@ def make_rig(
     Parameters
     ----------
     parameters : Parameters
-        Node to its parameters.
+        Parameters by node.
     see, track : callable
-        Make the sensor, and the tracker if there are images.
+        Functions that create the sensor, and the tracker if there are images.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def make_rig(
 
 
 def _make_drives(parameters: Parameters) -> list[Component]:
-    # Imported only for level drive.
+    # Import late, because only level drive needs these modules.
     from needle_device_driver.device_driver import DeviceDriver  # noqa: PLC0415
     from needle_device_driver.parameters import DeviceDriverParameters  # noqa: PLC0415
     from needle_sim.drive_emulator import (  # noqa: PLC0415
@@ -113,14 +113,14 @@ def _make_drives(parameters: Parameters) -> list[Component]:
 
 
 def own_component(given: str) -> Component:
-    """Return a component of the class `MODULE:NAME`, which takes no arguments.
+    """Return an instance of the class `MODULE:NAME`, created without arguments.
 
     Modules in the current folder are found as well.
 
     Raises
     ------
     UserError
-        If there is no such class, or it is no component.
+        If there is no such class, or it is not a component.
     """
     module_name, _, name = given.partition(":")
     sys.path.insert(0, str(Path.cwd()))
@@ -150,7 +150,7 @@ COMPUTE: Mapping[str, Compute] = {
     "plane_controller": uniform(1e-3, 3e-3),
     "stereo_tracker": _tracker_time,
 }
-"""Component to the compute time of its handlers, as measured on two shared cores."""
+"""Compute time of the handlers by component, as measured on two shared cores."""
 
 
 def run_virtually(
@@ -175,14 +175,14 @@ def run_virtually(
     run_info : mapping
         Description of the run in the bag.
     real_time_factor : float
-        Virtual over real time; 0: as fast as possible.
+        Ratio of virtual to real time; 0 for as fast as possible.
     check : callable
-        Raises KeyboardInterrupt to end the run.
+        Called regularly; raises KeyboardInterrupt to end the run.
 
     Raises
     ------
     UserError
-        If the rig did not get ready or a component ended before the operator.
+        If the rig did not become ready, or a component ended before the operator.
     """
     tap, progress = BagTap(bag, components, (DIAGNOSTICS, LOG), run_info), Progress(sys.stderr)
 

@@ -39,7 +39,7 @@ _MAX_EXPOSURES = 2
 _CHECK_PERIOD = 0.05
 
 Item = Exposure | m.JointState | None
-"""Input of the process; None: a timer tick."""
+"""Input of the process; None is a timer tick."""
 Done = Future[list[Action]]
 
 
@@ -49,11 +49,11 @@ class VisionWorker:
     Parameters
     ----------
     parameters : Parameters
-        Node to its parameters.
+        Parameters by node.
     """
 
     instance: ClassVar[VisionWorker]
-    """Instance of the process."""
+    """The only instance in the process."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._cameras = StereoCameras(settings_of(SimRigParameters, parameters, "sim_rig"))
@@ -89,14 +89,14 @@ class VisionProcess:
     Parameters
     ----------
     parameters : Parameters
-        Node to its parameters.
+        Parameters by node.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._pool = start_worker(VisionWorker.open, parameters)
 
     def open(self, arrive: Callable[[tuple[Done] | PortChange], None]) -> None:
-        """Start to pass on results."""
+        """Pass results to `arrive` from now on."""
         self._arrive = arrive
 
     def send(self, batch: Sequence[tuple[Item, Moment]]) -> None:
@@ -123,7 +123,7 @@ class RemoteTracker(Component):
     name = "stereo_tracker"
 
     def __init__(self) -> None:
-        # For each pending input, in order: whether it is an exposure.
+        # Whether each pending input is an exposure, in order.
         self._pending: deque[bool] = deque()
         self.inputs = (Input("joint_states", m.JointState, self._submit, JOINT_STATES),)
         self.outputs = (

@@ -1,8 +1,8 @@
-"""Runs the parts of a study, or of another job, on a Dask cluster.
+"""Execution of the parts of a study, or of another job, on a Dask cluster.
 
-The parts of a worker that dies are repeated by another. A worker with different code, or other
-versions of numerical libraries, ends the job, because its results would differ. Every machine of a
-study also steers the same few needles, because processors may round differently.
+If a worker dies, another one repeats its parts. A worker with different code or other versions of
+numerical libraries ends the job, because its results would differ. Every machine of a study also
+steers the same few needles, to detect processors that round differently.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ def on_cluster(
 ) -> Iterator[Result]:
     """Yield the results of `work` on each part, in the order of the parts.
 
-    A connection that is lost is made again, for the parts that are missing.
+    A lost connection is restored, to compute the parts that are still missing.
 
     Parameters
     ----------
     address : str
         Address of the scheduler, such as tcp://10.0.0.5:8786. The call waits for workers.
     work : callable
-        A module function, which workers can import.
+        A module-level function, which workers can import.
     parts : sequence
         Arguments that can be pickled.
 
@@ -69,13 +69,13 @@ def on_cluster(
             "as the scheduler prints it"
         )
     try:
-        # Optional dependency, and a second of imports.
+        # Optional dependency that takes a second to import.
         import distributed  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise UserError(
             "--scheduler: Dask is not installed; scripts/dask --version installs it"
         ) from error
-    # It also raises what it logs.
+    # Disable its log, because it also raises the logged errors.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     run = functools.partial(_run, work, identity())
     # Results that arrived before those of earlier parts.
@@ -96,7 +96,7 @@ def on_cluster(
             try:
                 for future in done:
                     early[numbers[future.key]] = future.result()
-                    # The cluster may forget it.
+                    # Allow the cluster to free the result.
                     future.release()
                     while yielded in early:
                         yield early.pop(yielded)
@@ -115,7 +115,7 @@ def on_cluster(
 
 @functools.lru_cache(maxsize=1)
 def identity() -> Mapping[str, str]:
-    """Return the versions of libraries, and a digest of the code, of this process."""
+    """Return the library versions and a digest of the code in this process."""
     code = hashlib.sha256()
     for package in _PACKAGES:
         spec = importlib.util.find_spec(package)
@@ -153,14 +153,14 @@ def _line(error: BaseException) -> str:
 
 
 class ClusterPart(NamedTuple):
-    """A part to run on any machine.
+    """Part of a study that any machine can run.
 
     Attributes
     ----------
     part : StudyPart
         The part of the study.
     witness : StudyPart
-        A few needles that every machine steers, to compare their last bits.
+        A few needles that every machine steers, to compare the results bit by bit.
     """
 
     part: StudyPart
@@ -210,16 +210,16 @@ def run_parts(
     Returns
     -------
     outcomes : list of Outcomes or PointOutcomes
-        In the order of the parts.
+        Outcomes, in the order of the parts.
     cpu_s : float
-        Their total processor time [s].
+        Total processor time of the parts [s].
     differing : list of str
         Machines that round differently from this one.
 
     Raises
     ------
     UserError
-        As of `on_cluster`.
+        For the same reasons as `on_cluster`.
     """
     asked = [ClusterPart(part, witness) for part in parts]
     done = []

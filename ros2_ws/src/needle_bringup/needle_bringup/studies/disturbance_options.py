@@ -113,7 +113,7 @@ def disturbances_of(given: argparse.Namespace) -> Disturbances:
 
 
 def _noise(given: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields of the tip noise, of one kind."""
+    """Return the settings of the tip noise, which must be of one kind."""
     kinds = [name for name in ("correlated", "student", "bias_walk") if getattr(given, name)]
     if len(kinds) > 1 or (kinds and given.noise_shape != "uniform"):
         names = [f"--{name.replace('_', '-')}" for name in kinds]

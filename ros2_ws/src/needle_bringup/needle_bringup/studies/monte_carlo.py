@@ -45,7 +45,7 @@ LABELS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `monte_carlo`; returns its exit code."""
+    """Run `monte_carlo`; return its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
     return run_command(lambda: monte_carlo(parse(words)))
 
@@ -54,7 +54,7 @@ def monte_carlo(options: MonteCarloOptions) -> int:
     """Run a study, print its figures and write its files."""
     parts = parts_of(options)
     witness = parts[0].of_first(2)
-    # Compile before the time measurement.
+    # Compile the code before measuring the time.
     witness.run()
     begin, worked_before = time.perf_counter(), time.process_time()
     steps = settings_of(options).steps
@@ -87,7 +87,7 @@ def monte_carlo(options: MonteCarloOptions) -> int:
     if options.json is not None:
         names = ("controller", "estimator", "law", "planner", "grid", "seed")
         asked: dict[str, JsonValue] = {name: getattr(options, name) for name in names}
-        # A study has figures either of the plane or of points.
+        # A study has figures either for the plane or for points.
         write_json(options.json, {**dict.fromkeys(LABELS), **seen, **asked})
     return EXIT_DONE
 

@@ -76,9 +76,9 @@ _OF_THE_STUDY = (
 
 @dataclasses.dataclass(frozen=True)
 class MonteCarloOptions:
-    """Options of a study; SI.
+    """Options of a study, in SI units.
 
-    `of_a_run` has the options of each run besides its start and its point, as typed.
+    `of_a_run` contains the options of each run except its start and target point, as typed.
     """
 
     controller: str
@@ -161,7 +161,7 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
 
 
 def _of_a_run(given: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the options of every run; `rotation_deg` is renamed, because it is a result."""
+    """Return the options of every run; `rotation_deg` is renamed, as a result has this name."""
     renamed = {"rotation_deg": "most_rotation_deg"}
     return {
         renamed.get(name, name): value or ""

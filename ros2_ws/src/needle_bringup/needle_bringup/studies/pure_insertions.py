@@ -14,25 +14,25 @@ from needle_controller.curvature.curvature_fit import circle_curvature, fit_curv
 Floats = npt.NDArray[np.float64]
 
 RADIUS = 0.122
-"""1 / kappa of the needle there [m]."""
+"""1 / kappa of the paper's needle [m]."""
 NOISE = 1e-3
-"""Largest error of a measured coordinate there [m]."""
+"""Largest error of a measured coordinate in the paper [m]."""
 ARC = 0.06
-"""Insertion [m]; a tip is measured every mm."""
+"""Length of an insertion [m]; a tip is measured every mm."""
 HEADING_STD = math.radians(5.0)
 ENTRY_STD = 0.5e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class CurvatureErrors:
-    """Errors over many insertions, as shares of the true value.
+    """Relative errors of the curvature over many insertions.
 
     Attributes
     ----------
     bias, spread : float
-        Mean and standard deviation of 1 / kappa by the most likely arc.
+        Mean and standard deviation of the error of 1 / kappa from the most likely arc.
     circle_bias, circle_spread : float
-        The same of kappa by a plain least-squares circle.
+        The same for kappa from a plain least-squares circle.
     """
 
     bias: float
@@ -57,8 +57,8 @@ def pure_insertions(count: int, rng: np.random.Generator) -> tuple[Floats, Float
     Returns
     -------
     tips : ndarray, shape (count, 61, 3)
-        On circles of radius `RADIUS` with random roll, a heading error of 5 deg and an entry error
-        of 0.5 mm (standard deviations), with +-1 mm of uniform noise [m].
+        Tips on circles of radius `RADIUS` with random roll, a heading error of 5 deg and an entry
+        error of 0.5 mm (standard deviations), with +-1 mm of uniform noise [m].
     insertion : ndarray, shape (61,)
         Insertion depths [m].
     """

@@ -50,9 +50,9 @@ SLIDING_MODE, RRT = "sliding_mode", "rrt"
 """Names of the reference laws for points."""
 CURVATURE = SteeringSettings.curvature
 STEP_LENGTH = SteeringSettings.step_length
-# The linear observer needs a twentieth of the memory of the filter.
+# The linear observer needs a twentieth of the filter's memory.
 _LINEAR_CHUNK = 20 * CHUNK
-# Upper limit of the settings; a study has its own depth [m].
+# Depth in the controller's settings, at their upper limit, as a study has its own depth [m].
 _DEEPEST = 1.0
 
 
@@ -62,9 +62,9 @@ class SteeredNeedles:
     Parameters
     ----------
     new_estimators : callable
-        Returns the estimators of a number of needles.
+        Returns the estimators, given the number of needles.
     rates : callable
-        Returns the rotation rates, (N,) [rad/m], for estimators at an inserted length [m].
+        Returns the rotation rates, (N,) [rad/m], given the estimators and an inserted length [m].
     covariance : ndarray, shape (3, 3), optional
         Claimed covariance of each tip [m^2]; by default the estimator's own assumption.
     turn_delay : float
@@ -129,7 +129,7 @@ class NeedlesToPoints(SteeredNeedles):
     new_estimators, covariance :
         See `SteeredNeedles`.
     new_laws : callable
-        Returns the laws from the motion of the targets.
+        Returns the laws, given the motion of the targets.
     rotation_budget : float
         Maximum total rotation of each base [rad].
     """
@@ -213,7 +213,7 @@ class PaperNeedles:
         return self._needles.step(lengths, unturned, d_rotation, tips, ages)
 
     def belief(self) -> Belief | None:
-        """Return None: the steady-state gain uses no covariance."""
+        """Return None, because an observer with a steady-state gain has no covariance."""
         return None
 
 
@@ -232,7 +232,7 @@ def controller_factory(
     own: Mapping[str, Any] = {},
     first: int = 0,
 ) -> Callable[[], SteeredNeedles | PaperNeedles]:
-    """Return a factory of the controller of some needles.
+    """Return a factory of the controller of a group of needles.
 
     Parameters
     ----------
@@ -241,16 +241,16 @@ def controller_factory(
     claimed : float
         Claimed maximum error of a measured coordinate [m].
     flip_depths : sequence of float
-        Insertions at which the bevel is flipped, mirrored, in rising order [m].
+        Insertions at which the bevel is flipped, mirrored, in ascending order [m].
     sigma_scale : float
-        Other than 1: each tip has a covariance instead of the bound; its standard deviations are
-        those of uniform noise within `claimed`, divided by this.
+        If it is not 1, each tip has a covariance instead of the bound, with the standard deviations
+        of uniform noise within `claimed`, divided by this.
     turn_delay : float
         See `study.StudySettings` [m].
     own : mapping
-        Settings `estimator`, `law`, `planner` of other packages, and `seed`.
+        Settings `estimator`, `law`, `planner` from other packages, and `seed`.
     first : int
-        Number of the first needle, which seeds the random numbers of an own estimator.
+        Number of the first needle, which seeds the random numbers of an external estimator.
 
     Raises
     ------
@@ -287,11 +287,11 @@ def point_controller_factory(
     own: Mapping[str, Any] = {},
     first: int = 0,
 ) -> Callable[[], NeedlesToPoints]:
-    """Return what makes the controller of some needles that are steered to points.
+    """Return a factory of the controller of a group of needles that are steered to points.
 
-    Parameters and errors as of `controller_factory`. A preset that does not estimate the whole pose
-    is rejected; the reference laws use the estimator of `best`. `rotation_budget` is the maximum
-    total rotation of each base [rad]; the reference laws ignore it.
+    Parameters and errors are those of `controller_factory`. A preset that does not estimate the
+    whole pose is rejected; the reference laws use the estimator of `best`. `rotation_budget` is the
+    maximum total rotation of each base [rad]; the reference laws ignore it.
     """
     preset = "best" if name in {SLIDING_MODE, RRT} else name
     settings, covariance = _claimed_settings(preset, claimed, sigma_scale, (), own)

@@ -1,4 +1,4 @@
-"""Estimators of the needles of a study: of any kind one by one, or `best` in compiled loops."""
+"""Estimators for the needles of a study: any kind one by one, or `best` in compiled loops."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from needle_sim.studies.figures_of_merit import Belief
 
 
 class Estimators(Protocol):
-    """The estimators of N needles."""
+    """Estimators of N needles."""
 
     def start(self, tips: FloatArray) -> None:
         """Start at the first tips, (N, 3) [m], with all rotations 0."""
@@ -25,7 +25,7 @@ class Estimators(Protocol):
         """Advance by inserted lengths [m] and base rotations [rad], (N,)."""
 
     def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
-        """Correct by tips, (N, 3) [m], with a covariance, (3, 3), and their ages, (N,) [m]."""
+        """Correct by tips, (N, 3) [m], given a covariance, (3, 3), and their ages, (N,) [m]."""
 
     def each(self) -> Sequence[Estimate]:
         """Return the estimate of each needle."""
@@ -43,7 +43,7 @@ class SeparateEstimators:
     Parameters
     ----------
     new : callable
-        Returns the estimator of the needle with a number from 0.
+        Returns the estimator of a needle, given its number from 0.
     """
 
     def __init__(self, new: Callable[[int], Estimator]) -> None:
@@ -93,7 +93,7 @@ class SeparateEstimators:
 
 
 class BestEstimators(ManyFilters):
-    """The estimators of preset `best`, in compiled loops; see `Estimators`."""
+    """Estimators of preset `best`, in compiled loops; see `Estimators`."""
 
     def belief(self) -> Belief:
         """Return the estimates of all needles."""

@@ -1,4 +1,4 @@
-"""Laws of the needles of a study: of any kind one by one, or `best` in compiled loops."""
+"""Laws for the needles of a study: any kind one by one, or `best` in compiled loops."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TimedLaw = Callable[[Estimate, float, float, float], SteeringCommand]
 """Maps an estimate, time [s], insertion [m] and remaining rotation [rad] to a command."""
 
 CLEAR = 0.00085
-"""Clearance of the published planner: the needle's radius and half a mm [m]."""
+"""Clearance of the published planner: the needle's radius plus 0.5 mm [m]."""
 
 PointLaws = Callable[[Any, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 """Maps estimators, inserted lengths [m] and remaining rotations [rad], (N,), to rotation rates
@@ -38,7 +38,7 @@ PointLaws = Callable[[Any, FloatArray, FloatArray], tuple[FloatArray, FloatArray
 
 
 def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[Estimators, float], FloatArray]:
-    """Return rotation rates by laws that are called one by one."""
+    """Return a function for the rotation rates from laws that are called one by one."""
     laws: list[StepLaw] = []
 
     def rates(estimators: Estimators, insertion: float) -> FloatArray:
@@ -59,7 +59,7 @@ def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], Timed
     motion : TargetMotion
         Motion of all targets.
     new_law : callable
-        Returns the law of a needle from the motion of its target.
+        Returns the law of a needle, given the motion of its target.
     """
     laws: list[tuple[TargetMotion, TimedLaw]] = []
 
@@ -84,7 +84,7 @@ def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], Timed
 
 
 def best_rates(settings: SteeringSettings) -> Callable[[ManyFilters, float], FloatArray]:
-    """Return rotation rates by the law of `best`, in compiled loops."""
+    """Return a function for the rotation rates from the law of `best`, in compiled loops."""
     law, plan = RollLawSettings(**settings.turning), FlipPlan(settings.flip_depths)
 
     def rates(filters: ManyFilters, insertion: float) -> FloatArray:
@@ -152,7 +152,7 @@ def rrt_law(
 
     def command(estimate: Estimate, *_: float) -> SteeringCommand:
         ahead = estimate.rotation.T @ (motion.last - estimate.position)
-        # Default without a path: the tightest arc towards the target.
+        # Default if no path is found: the tightest arc towards the target.
         arc = np.array([ahead[0], ahead[1], 1.0])
         plan(
             np.array(estimate.position),

@@ -1,6 +1,6 @@
-"""A study in independent parts of some needles each, and their results.
+"""Division of a study into independent groups of needles, and their results.
 
-Random numbers are seeded by the needle, and those of an own estimator by the part, so that the
+Random numbers are seeded by the needle, and those of an external estimator by the part, so that the
 outcomes of a part do not depend on where or when it runs.
 """
 
@@ -36,7 +36,7 @@ _OWN = ("estimator", "law", "planner", "seed", "step_length")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StudyPart:
-    """Needles of a study that are steered together.
+    """Group of needles of a study that are steered together.
 
     Attributes
     ----------
@@ -45,9 +45,9 @@ class StudyPart:
     first : int
         Number of the first needle.
     starts : ndarray, shape (N, 3)
-        x [m], pitch, roll [rad] of each.
+        Initial x [m], pitch and roll [rad] of each needle.
     places : ndarray, shape (N, 3)
-        Target point of each [m]; (0, 3) if the target is the plane.
+        Target point of each needle [m]; (0, 3) if the target is the plane.
     """
 
     options: MonteCarloOptions
@@ -56,7 +56,7 @@ class StudyPart:
     places: FloatArray
 
     def of_first(self, count: int) -> StudyPart:
-        """Return a part with its first needles only."""
+        """Return a part with only the first needles of this one."""
         return dataclasses.replace(
             self, starts=self.starts[:count].copy(), places=self.places[:count].copy()
         )

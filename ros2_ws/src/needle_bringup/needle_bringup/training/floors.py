@@ -1,6 +1,6 @@
-"""Random floors behind a needle, and clutter beside or over it.
+"""Random floors behind a needle, and clutter beside or in front of it.
 
-The ranges are wide, so that the net generalises. This code is independent of the renderer of
+The ranges are wide, so that the net generalises. This code is independent of the renderer in
 needle_sim, with which the tracker is tested.
 """
 
@@ -164,7 +164,7 @@ def _bubble(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _line(rng: np.random.Generator, image: Image) -> Image:
-    """Draw a scratch, lint or an old track: thinner or fainter than a needle."""
+    """Draw a scratch, lint or an old track, which is thinner or fainter than a needle."""
     size = len(image)
     start, heading = rng.uniform(-size / 8, 1.125 * size, 2), rng.uniform(0.0, 2 * np.pi)
     bend = rng.normal(0.0, 0.02)

@@ -1,6 +1,6 @@
 """Random needle ends in one view, their shadows, and tracks of earlier needles in the gel.
 
-An end is a tube or rod with a ground bevel; a track is a factor of the gel's brightness.
+An end is a tube or rod with a ground bevel; a track is a factor on the brightness of the gel.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from needle_bringup.training.samples import moved
 
 Image = NDArray[np.float32]
 _FINE = 3
-"""Sub-pixels across a pixel."""
+"""Number of sub-pixels across a pixel."""
 _TWIN = 0.4  # share of shadows that look like the needle
 _FADING = 0.25  # share of ends that lose contrast near the tip, as in real photographs
-_FAINT = 0.15  # maximum change of brightness by a track without a background
+_FAINT = 0.15  # maximum change of brightness by a track if there is no background
 _GEL_PX = 3.0  # maximum motion of the gel
 _MOST = 3
-_BROKEN, _PIECE_PX, _PIECES = 0.4, (5.0, 80.0), 60  # share in pieces; their length; their number
-_BLUNT = 0.15  # length of a straight end with its burr, as a share of the needle's width
+_BROKEN, _PIECE_PX, _PIECES = 0.4, (5.0, 80.0), 60  # share of broken tracks; piece length, number
+_BLUNT = 0.15  # length of a straight end with its burr, relative to the needle's width
 
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """Place of a needle in a patch.
+    """Pose of a needle in a patch.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Pose:
 
 
 def random_pose(rng: np.random.Generator, size: int, radius: float) -> Pose:
-    """Return a random pose; usually the end is well inside the patch."""
+    """Return a random pose, usually with the end well inside the patch."""
     heading = rng.uniform(0.0, 2 * np.pi)
     x, y = rng.uniform(0.2 * size, 0.8 * size, 2)
     if rng.random() < 0.25:
@@ -86,7 +86,7 @@ def random_pose(rng: np.random.Generator, size: int, radius: float) -> Pose:
 
 
 def coarse(fine: Image) -> Image:
-    """Return the pixels of a fine image."""
+    """Reduce a fine image to pixels."""
     size = len(fine) // _FINE
     return np.asarray(cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA), np.float32)
 
@@ -133,8 +133,8 @@ def draw_needle(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
 def draw_shadow(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
     """Return an image with the shadow of a needle on the floor: softer, and possibly shorter.
 
-    Often it is as dark and sharp as the needle and touches it: only what is known of the needle's
-    way then tells the two apart, and the net must show both ends.
+    Often it is as dark and sharp as the needle and touches it. In this case only knowledge of the
+    needle's path distinguishes the two, and the net must show both ends.
     """
     twin = rng.random() < _TWIN
     away = rng.uniform(0.0, 10.0 * pose.radius if twin else 45.0) * rng.choice([-1.0, 1.0])
@@ -150,7 +150,7 @@ def draw_shadow(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
     if twin:
         sharp = cv2.GaussianBlur(true_map(other, len(image)), (0, 0), rng.uniform(0.3, 0.8))
         return np.asarray(image * (1.0 - rng.uniform(0.4, 0.9) * sharp), np.float32)
-    # The shadow of a small lamp is as sharp as the needle.
+    # A small lamp casts a shadow that is as sharp as the needle.
     softness = float(np.exp(rng.uniform(np.log(0.3), np.log(7.0))))
     soft = cv2.GaussianBlur(true_map(other, len(image)), (0, 0), softness)
     return np.asarray(image * (1.0 - rng.uniform(0.1, 0.8) * soft), np.float32)
@@ -171,7 +171,7 @@ def _metal(rng: np.random.Generator, near: float, along: Image, rho: Image) -> I
         place = rng.uniform(-0.85, 0.85) + rng.normal(0.0, 0.004) * along
         width = rng.uniform(0.08, 0.5)
         glint = strength * np.exp(-(((rho - place) / width) ** 2))
-        if rng.random() < 0.5:  # a reflection ends where the angle no longer fits
+        if rng.random() < 0.5:  # a reflection ends where the angle no longer matches
             begin, slope = rng.uniform(-70.0, 5.0), rng.uniform(0.3, 12.0) * rng.choice([-1, 1])
             glint = glint / (1.0 + np.exp(np.clip((along - begin) / slope, -30, 30)))
         metal = metal + glint
@@ -185,7 +185,7 @@ def _metal(rng: np.random.Generator, near: float, along: Image, rho: Image) -> I
 def _face(
     rng: np.random.Generator, near: float, along: Image, ground: Image, length: float
 ) -> Image:
-    """Return the brightness of a ground face: it reflects a lamp, darkness, or the floor."""
+    """Return the brightness of a ground face, which reflects a lamp, darkness, or the floor."""
     kind = rng.choice(["dark", "bright", "grey", "floor"], p=[0.4, 0.3, 0.2, 0.1])
     if kind == "floor":
         return np.asarray(ground * rng.uniform(0.85, 1.15), np.float32)
@@ -206,18 +206,18 @@ def _face(
 
 
 def drawn_tracks(rng: np.random.Generator, pose: Pose, size: int, *, faint: bool) -> Image:
-    """Return the factor of each pixel's brightness by old tracks.
+    """Return the factor by which old tracks change the brightness of each pixel.
 
     Parameters
     ----------
     rng : Generator
-        What draws them.
+        Random generator.
     pose : Pose
-        Of the needle: some tracks run along it, and on beyond its end.
+        Pose of the needle; some tracks run along it and beyond its end.
     size : int
         Width and height [px].
     faint : bool
-        No track may look like a needle.
+        Whether to draw only tracks that do not look like a needle.
     """
     factor = np.ones((size, size), np.float32)
     for _ in range(rng.integers(1, _MOST + 1)):
@@ -239,14 +239,14 @@ def drawn_tracks(rng: np.random.Generator, pose: Pose, size: int, *, faint: bool
 
 
 def shifted_tracks(rng: np.random.Generator, factor: Image) -> Image:
-    """Return the tracks in the background image: unchanged, or shifted by motion of the gel."""
+    """Return the tracks in the background image, unchanged or shifted by motion of the gel."""
     if rng.random() < 0.5:
         return factor
     return moved(factor, rng.uniform(0.0, _GEL_PX), rng.uniform(0.0, 2.0 * np.pi))
 
 
 def faded(factor: Image, strength: float, blur_px: float) -> Image:
-    """Return a factor closer to 1, and blurred."""
+    """Return a blurred factor that is closer to 1."""
     if blur_px > 0.0:
         factor = np.asarray(cv2.GaussianBlur(factor, (0, 0), blur_px), np.float32)
     return np.asarray(1.0 + np.float32(strength) * (factor - 1.0), np.float32)
@@ -259,7 +259,7 @@ def made_faint(factor: Image) -> Image:
 
 
 def _cloudy(rng: np.random.Generator, pose: Pose, size: int, faint: bool) -> Image:
-    """Return a torn, clouded track: soft, patchy, sometimes with two rims."""
+    """Return a torn, clouded track that is soft, patchy, and sometimes has two rims."""
     profile = true_map(pose, size)
     sigma = pose.radius * rng.uniform(0.15, 0.9)
     soft = cv2.GaussianBlur(profile, (0, 0), sigma)

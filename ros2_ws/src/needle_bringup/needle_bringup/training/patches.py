@@ -1,4 +1,4 @@
-"""Samples of drawn scenes: a floor, clutter, old tracks, a needle with its shadow."""
+"""Samples of drawn scenes with a floor, clutter, old tracks, and a needle with its shadow."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def patch(rng: np.random.Generator) -> Sample:
     Parameters
     ----------
     rng : Generator
-        What draws it.
+        Random generator.
     """
     width = random_width(rng)
     pose = random_pose(rng, CANVAS, 0.5 * width)
@@ -71,14 +71,14 @@ def patch(rng: np.random.Generator) -> Sample:
 
 
 def _alike(rng: np.random.Generator, image: Image, before: Image) -> tuple[Image, Image]:
-    """Return both images with the same clutter in front."""
+    """Draw the same clutter in front of both images."""
     seed = int(rng.integers(_SEED))
     one, other = (clutter(np.random.default_rng(seed), each) for each in (image, before))
     return one, other
 
 
 def _with(image: Image, pose: Pose, needle: int | None, shadow: int | None) -> Image:
-    """Return an image with a needle and its shadow, drawn by the seeds; without a pose, none."""
+    """Return an image with a needle and its shadow, each drawn only if its seed is given."""
     if shadow is not None:
         image = draw_shadow(np.random.default_rng(shadow), image, pose)
     if needle is not None:
@@ -87,7 +87,7 @@ def _with(image: Image, pose: Pose, needle: int | None, shadow: int | None) -> I
 
 
 def _earlier(rng: np.random.Generator, pose: Pose, there: bool) -> Pose | None:
-    """Return the pose of the needle in the background; None without a needle."""
+    """Return the pose of the needle in the background; None if there is no needle."""
     chance = rng.random()
     back = float(np.exp(rng.uniform(np.log(1.0), np.log(90.0))))
     if chance < _LONGER:

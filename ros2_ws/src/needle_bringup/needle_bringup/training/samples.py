@@ -1,7 +1,7 @@
-"""Samples for the needle net, and what a camera does to their images.
+"""Samples for the needle net, and the effects of a camera on their images.
 
 A sample has an image, a background, and the position of shaft and end. The effects of camera and
-codec are equal for all images of one camera.
+codec are the same for all images of one camera.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ _OTHER_FOCUS, _FOCUS_PX = 0.1, (0.5, 1.2)  # probability and range of an additio
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sample:
-    """A patch with its border.
+    """Patch with its border.
 
     Attributes
     ----------
     image : ndarray of uint8, shape (CANVAS, CANVAS)
         Camera image.
     background : ndarray of uint8, shape (CANVAS, CANVAS), or None
-        The same view with less of the needle, none, or sometimes more; None: unknown.
+        The same view with less of the needle, none of it, or sometimes more; None if unknown.
     share : ndarray of uint8, shape (CANVAS, CANVAS)
         255 times the share of each pixel that belongs to the shaft, cut straight at its end.
     end : ndarray, shape (2,)
-        Column and row of the end [px]; NaN without one.
+        Column and row of the end [px]; NaN if there is none.
     width_px : float
-        Width of the needle [px], also without a needle.
+        Width of the needle [px], also given if there is no needle.
     """
 
     image: NDArray[np.uint8]
@@ -63,7 +63,7 @@ def random_width(rng: np.random.Generator) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class CameraEffects:
-    """Optics, sensor and codec of a camera, in the order of their effect.
+    """Effects of the optics, sensor and codec of a camera, in order of application.
 
     Attributes
     ----------
@@ -72,19 +72,19 @@ class CameraEffects:
     gamma, gain : float
         Gamma and gain of the brightness.
     blur_px : float
-        Sigma of the blur of the optics [px].
+        Sigma of the optical blur [px].
     shrink : float
-        Factor by which the image is reduced, and enlarged again; 1: none.
+        Factor by which the image is reduced before it is enlarged again; 1 for none.
     noise, noise_share : float
-        Sigma of the sensor noise, in grey levels and as a share of the brightness.
+        Sigma of the sensor noise, in grey levels and relative to the brightness.
     noise_blur_px : float
-        Correlation length of the noise [px]; 0: white.
+        Correlation length of the noise [px]; 0 for white noise.
     denoise : str
         "median", "bilateral" or "".
     sharpen, sharpen_px : float
         Gain and blur sigma [px] of the unsharp mask.
     quality : int
-        JPEG quality; 0: no compression.
+        JPEG quality; 0 for no compression.
     """
 
     haze: float
@@ -103,7 +103,7 @@ class CameraEffects:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> CameraEffects:
-        """Return a random camera; half of all noise is below two grey levels."""
+        """Return a random camera; half of them have noise below two grey levels."""
 
         def sometimes(chance: float, low: float, high: float, otherwise: float) -> float:
             return float(rng.uniform(low, high)) if rng.random() < chance else otherwise
@@ -126,7 +126,7 @@ class CameraEffects:
         )
 
     def apply(self, rng: np.random.Generator, image: Image) -> Bytes:
-        """Return an image of this camera.
+        """Return the image that this camera takes.
 
         Parameters
         ----------
@@ -193,7 +193,7 @@ def exposed(
     rng : Generator
         Generator of the camera and its noise.
     image, before : ndarray of float32, shape (size, size)
-        Brightness, 0 to 255 and beyond; no background if `before` is None.
+        Brightness, 0 to 255 and beyond, of the scene and its background, if any.
     """
     effects = CameraEffects.draw(rng)
     seen = effects.apply(rng, image)

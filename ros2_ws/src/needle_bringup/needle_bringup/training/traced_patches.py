@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _AT_END, _ON_SHAFT = 0.55, 0.25  # probabilities of the centre; otherwise anywhere
-_BESIDE_PX = 0.4 * SIZE  # maximum distance of the subject from the middle
-_LARGEST = 1.8  # maximum scale; a larger one only blurs the image
+_BESIDE_PX = 0.4 * SIZE  # maximum distance of the subject from the centre
+_LARGEST = 1.8  # maximum scale; a larger one would only blur the image
 _SMALLER, _BLUR = (
     0.8,
     0.45,
@@ -47,9 +47,9 @@ class Cut:
     Attributes
     ----------
     place : ndarray, shape (2,)
-        Column and row of the middle [px].
+        Column and row of the centre [px].
     scale : float
-        New pixels per pixel.
+        Pixels of the patch per pixel of the image.
     angle : float
         Rotation of the patch [rad].
     """
@@ -63,7 +63,7 @@ class Cut:
         return np.asarray(self._turn() @ (point - self.place) + 0.5 * (CANVAS - 1))
 
     def image(self, image: NDArray[np.uint8]) -> Image:
-        """Return the patch of an image, (CANVAS, CANVAS), mirrored beyond the edges."""
+        """Return the patch from an image, (CANVAS, CANVAS), mirrored beyond the edges."""
         reach = int(0.75 * CANVAS / self.scale) + 8
         corner = np.rint(self.place).astype(int) - reach
         low = np.clip(corner, 0, None)
@@ -84,7 +84,7 @@ class Cut:
 
 
 def traced_patch(rng: np.random.Generator, scenes: Sequence[TracedScene]) -> Sample:
-    """Return a sample of one of the scenes.
+    """Return a random sample from the scenes.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def traced_patch(rng: np.random.Generator, scenes: Sequence[TracedScene]) -> Sam
     before = cut.image(scene.images[_earlier(rng, i, len(scene.images))]) if known else None
     if rng.random() < _TRACKS:
         tracks = _tracks(rng, scene, i, cut, faint=not known)
-        # Most tracks are behind the needle, or contain it.
+        # In most cases, the needle covers the tracks.
         uncovered = np.float32(1.0) - (share / np.float32(255.0)) * (rng.random() < 0.7)
         image = image * (1.0 + (tracks - 1.0) * uncovered)
         before = None if before is None else before * shifted_tracks(rng, tracks)
@@ -119,7 +119,7 @@ def traced_patch(rng: np.random.Generator, scenes: Sequence[TracedScene]) -> Sam
 
 
 def _earlier(rng: np.random.Generator, i: int, count: int) -> int:
-    """Return the index of the background of the same camera: empty, shorter or longer."""
+    """Return the index of a background of the same camera: no needle, a shorter or a longer one."""
     others = np.arange(i % 2, count, 2)
     longer, shorter = others[others > i], others[(others < i) & (others > 1)]
     chance = rng.random()
@@ -127,14 +127,14 @@ def _earlier(rng: np.random.Generator, i: int, count: int) -> int:
         return int(rng.choice(longer))
     if chance < 0.5 and len(shorter):
         return int(rng.choice(shorter))
-    # Rarely the image is its own background, for views never seen without the needle.
+    # Rarely use the image as its own background, as for views never recorded without the needle.
     return i if 0.5 <= chance < 0.53 else i % 2
 
 
 def _tracks(
     rng: np.random.Generator, scene: TracedScene, i: int, cut: Cut, *, faint: bool
 ) -> Image:
-    """Return the factor of each pixel's brightness by old tracks in a patch."""
+    """Return the factor by which old tracks change the brightness of each pixel of a patch."""
     if rng.random() > _OF_NEEDLE:
         end = cut.point(scene.ends[i])
         if not np.isfinite(end).all():
@@ -160,7 +160,7 @@ def _tracks(
 
 
 def _place(rng: np.random.Generator, scene: TracedScene, i: int) -> Array:
-    """Return the subject of a patch in an image [px]."""
+    """Return the position of a patch's subject in an image [px]."""
     chance, end = rng.random(), scene.ends[i]
     if chance < _AT_END and np.isfinite(end).all():
         return np.asarray(end)

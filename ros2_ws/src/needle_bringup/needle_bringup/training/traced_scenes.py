@@ -18,7 +18,7 @@ _EXPOSURES = 6
 # Ranges of the first insertion and of the step [m].
 _BEGIN, _STEP = (0.005, 0.03), (0.002, 0.008)
 _FINE, _SUBPIXEL_BITS = 4, 4  # sub-pixels across a pixel, and fractional bits of a corner
-_SIDEWAYS = 1e-4  # for the shaft's width in pixels [m]
+_SIDEWAYS = 1e-4  # sideways step to compute the shaft's width in pixels [m]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class TracedScene:
     ends : ndarray, shape (n, 2)
         Ends of the shaft [px]; NaN if outside the image.
     widths_px : ndarray, shape (n,)
-        Needle width in each image, also in those without a needle [px].
+        Needle width in each image [px], also given for images without a needle.
     """
 
     images: NDArray[np.uint8]
@@ -49,7 +49,7 @@ def trace_scene(mitsuba: Mitsuba, rig: StereoRig, seed: int) -> TracedScene:
     Parameters
     ----------
     mitsuba : Mitsuba
-        From `load_mitsuba`.
+        The renderer, from `load_mitsuba`.
     rig : StereoRig
         Cameras and phantom.
     seed : int

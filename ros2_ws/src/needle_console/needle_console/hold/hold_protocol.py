@@ -1,4 +1,4 @@
-"""Protocol between the pages and the console: the owner of the hold, messages and their times."""
+"""Protocol between the pages and the console: owner of the hold, messages and time limits."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from needle_console.hold.page_session import (
 )
 
 PERIOD = 0.02
-"""Period of the counts to each page, and of the reported hold [s]."""
+"""Period of the counts sent to each page, and of the reported hold [s]."""
 
 IDLE_PERIOD = 0.08
-"""Period of the reported hold without a page: a release, above 10 times a second [s]."""
+"""Period of the reported hold without a page; releases are reported at more than 10 Hz [s]."""
 
 SILENCE = 5.0
-"""A page that is silent for this time is disconnected [s]."""
+"""Time without a message after which a page is disconnected [s]."""
 
 IDLE = 30.0
-"""An owner that has not pressed for this time gives the hold free [s]."""
+"""Time without a press after which other pages may take over the hold [s]."""
 
 OTHER_PAGE = "another page steers"
 _STALLED = f"no echo from this page for {ECHO_AGE_LIMIT:g} s (browser, network or console stalled)"
 
-# The expiry of a hold is checked slightly later than its end [s].
+# The expiry of a hold is checked this long after its end [s].
 _TICK = 1e-4
 
 
@@ -39,12 +39,12 @@ _TICK = 1e-4
 class _Page:
     session: PageSession
     is_local: bool
-    # Why its last press does not count; empty: it does, or the button is released.
+    # Reason why its last press does not count; empty if it counts or the button is released.
     why: str = ""
 
 
 class HoldProtocol:
-    """Handles the messages of all pages; `now` is the steady time [s] in every method.
+    """Handles the messages of all pages; `now` is the monotonic time [s] in every method.
 
     The first page that presses owns the hold until it disconnects or is idle, so that another page
     cannot take it over between two presses.
@@ -52,10 +52,10 @@ class HoldProtocol:
     Parameters
     ----------
     why_not : callable
-        Returns why a page may only watch, empty if it may hold; its argument is whether the page is
-        shown on the rig's own machine.
+        Returns the reason why a page may only watch, empty if it may hold; its argument is whether
+        the page is shown on the rig's own machine.
     on_state : callable
-        Receives the hold every `PERIOD`, without a page every `IDLE_PERIOD`, and on each change.
+        Receives the hold every `PERIOD` (`IDLE_PERIOD` without a page) and on each change.
     on_notice : callable
         Receives texts for the log.
     now : float
@@ -72,9 +72,9 @@ class HoldProtocol:
         self._why_not = why_not
         self._on_state = on_state
         self._on_notice = on_notice
-        # With all keys from the start: another thread may read it.
+        # All keys are set from the start, because another thread may read it.
         self._refusals = dict.fromkeys(HoldRefusal, 0)
-        # Of the messages to all pages: no two connections get the same count.
+        # Common to all pages, so that no two connections receive the same count.
         self._count = 0
         self._pages: dict[int, _Page] = {}
         self._last_page = 0
@@ -97,7 +97,7 @@ class HoldProtocol:
         self._report_change(now)
 
     def receive(self, page: int, data: str | bytes, now: float) -> HoldRefusal | None:
-        """Receive a page's message; return why it does not count. An invalid one ends the hold."""
+        """Receive a page's message; return the refusal, if any. An invalid one ends the hold."""
         self._end_if_stale(now)
         refusal = self._receive(page, data, now)
         if refusal is not None:
@@ -121,7 +121,7 @@ class HoldProtocol:
         return json.dumps(fields)
 
     def is_silent(self, page: int, now: float) -> bool:
-        """Return whether a page has been silent for too long, and count that."""
+        """Return whether a page has been silent for too long; if so, count a refusal."""
         if now - self._pages[page].session.received_at <= SILENCE:
             return False
         self.refuse(HoldRefusal.SILENT)
@@ -134,7 +134,7 @@ class HoldProtocol:
     def update(self, now: float) -> float:
         """Report the hold if it is due or has expired; return the time of the next call [s]."""
         period = PERIOD if self._pages else IDLE_PERIOD
-        # The first page shortens the period.
+        # The first page to connect shortens the period.
         self._due = min(self._due, now + period)
         if now >= self._due or (self._reported.pressed and now > self._until):
             self._report(now)
@@ -145,7 +145,7 @@ class HoldProtocol:
         return min(self._due, max(self._until, now) + _TICK)
 
     def refuse(self, refusal: HoldRefusal, detail: str = "") -> None:
-        """Count a refusal; the first of its kind is logged."""
+        """Count a refusal, and log the first of its kind."""
         self._refusals[refusal] += 1
         if self._refusals[refusal] == 1:
             self._on_notice(f"hold: {refusal.value}" + (f" ({detail})" if detail else ""))
@@ -156,7 +156,7 @@ class HoldProtocol:
 
     @property
     def _until(self) -> float:
-        """Time at which the hold ends unless a message arrives [s]; minus infinity: no hold."""
+        """Time at which the hold ends unless a message arrives [s]; -inf if there is no hold."""
         return -math.inf if self._owner is None else self._pages[self._owner].session.until
 
     def _receive(self, page: int, data: str | bytes, now: float) -> HoldRefusal | None:
@@ -175,19 +175,19 @@ class HoldProtocol:
         if holds or not hold.pressed:
             entry.why = ""
         elif refusal is not None:
-            # Keep the first reason until the release.
+            # Keep the first reason until the button is released.
             entry.why = entry.why or (bar if refusal is HoldRefusal.BARRED else refusal.value)
         return refusal
 
     def _bar(self, page: int, now: float) -> str:
-        """Return why a page may only watch and stop; empty: it may hold."""
+        """Return the reason why a page may only watch and stop; empty if it may hold."""
         if why := self._why_not(self._pages[page].is_local):
             return why
         is_free = self._owner in (None, page) or now - self._held_at > IDLE
         return "" if is_free else OTHER_PAGE
 
     def _end_if_stale(self, now: float) -> None:
-        """End an expired hold; after a stall, whichever method runs first does this."""
+        """End an expired hold; after a stall, the first method that runs does this."""
         if self._owner is not None and self._pages[self._owner].session.end_if_stale(now):
             self._pages[self._owner].why = _STALLED
             self.refuse(HoldRefusal.LOST, "no recent message from the page; press again")

@@ -1,4 +1,4 @@
-"""Server of the hold: WebSockets on a port of its own, in a thread beside the page's."""
+"""Server of the hold: WebSockets on a separate port, in a thread separate from the page's."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from needle_console.hold.hold_protocol import PERIOD, HoldProtocol
 from needle_console.hold.page_session import HoldRefusal, PageHold
 
 PATH = "/hold"
-# Longest time for a handshake, and for closing [s].
+# Time limit for a handshake, and for closing [s].
 _TIMEOUT = 1.0
 
 
 class HoldServer:
-    """Serves the hold's protocol (docs/safety.md), and reports the hold that counts.
+    """Server of the hold's protocol (docs/safety.md) that reports the valid hold.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class HoldServer:
     port : int
         Port to listen on; 0 selects a free one.
     why_not, on_state, on_notice : callable
-        As of `HoldProtocol`; the hold's thread calls them, so they must not block.
+        As for `HoldProtocol`; the hold's thread calls them, so they must not block.
 
     Raises
     ------
@@ -97,7 +97,7 @@ class HoldServer:
             compression=None,
             server_header=None,
             open_timeout=_TIMEOUT,
-            # The counts replace pings.
+            # The counts serve as pings.
             ping_interval=None,
             close_timeout=_TIMEOUT,
             logger=silent,
@@ -117,7 +117,7 @@ class HoldServer:
             self._woken.clear()
             now = time.monotonic()
             next_time = self._protocol.update(now)
-            # A task for each wait would double the load of an idle console: use one timer.
+            # Use one timer: a task for each wait would double the load of an idle console.
             timer = self._loop.call_later(next_time - now, self._woken.set)
             await self._woken.wait()
             timer.cancel()
@@ -154,7 +154,7 @@ class HoldServer:
         except ConnectionClosed:
             pass
         finally:
-            # First end the page's hold.
+            # End the page's hold first.
             self._protocol.close(page, time.monotonic())
             sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):

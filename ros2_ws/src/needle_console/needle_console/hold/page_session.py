@@ -1,4 +1,4 @@
-"""Hold of one page: which of its messages count, and until when."""
+"""Hold of one page: validity of its messages, and expiry of the hold."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ OWNER = "console"
 # The hold must end within 0.3 s. A shorter limit would end it on a busy machine, where browsers
 # stall for more than 0.1 s.
 ECHO_AGE_LIMIT = 0.25
-"""A message counts for this time after the count that it echoes was sent [s]."""
+"""Time for which a message is valid after the count that it echoes was sent [s]."""
 
-# Number of counts that are remembered: five seconds.
+# Number of sent counts that are stored, for five seconds.
 _MAX_SENT = 250
 
 _KEYS = {"count", "pressed", "speed", "mode"}
@@ -86,7 +86,7 @@ def read_message(data: str | bytes) -> tuple[int, PageHold]:
 
 
 class PageSession:
-    """Checks the messages of one connection; `now` is the steady time [s] in every method.
+    """Checks the messages of one connection; `now` is the monotonic time [s] in every method.
 
     A message may be delayed by page, browser, network or server, so it only proves that the button
     was pressed when the count that it echoes was sent. A hold therefore ends `ECHO_AGE_LIMIT`
@@ -100,11 +100,11 @@ class PageSession:
     Attributes
     ----------
     echoed : int
-        The newest echoed count; 0: none yet.
+        The newest echoed count; 0 before the first.
     received_at : float
         Time of the last message, or of the connection [s].
     until : float
-        Time at which the hold ends unless a new message arrives [s]; minus infinity: no hold.
+        Time at which the hold ends unless a new message arrives [s]; -inf if there is no hold.
     """
 
     def __init__(self, now: float) -> None:
@@ -121,19 +121,19 @@ class PageSession:
         return RELEASED if now > self.until else self._hold
 
     def end_if_stale(self, now: float) -> bool:
-        """End a hold that has expired, and return whether it had; it needs a new press."""
+        """End an expired hold, and return whether it had expired; a new press is required then."""
         if self.until == -math.inf or now <= self.until:
             return False
         self.end()
         return True
 
     def end(self) -> None:
-        """End the hold; the next one needs a release and a new press."""
+        """End the hold; the next one requires a release and a new press."""
         self.until = -math.inf
         self._armed = False
 
     def note_sent(self, count: int, now: float) -> None:
-        """Note that a count is sent; it is greater than all before, on any connection."""
+        """Record a sent count, which must be greater than all earlier ones on any connection."""
         self._sent.append((count, now))
 
     def receive(
@@ -144,24 +144,24 @@ class PageSession:
         Parameters
         ----------
         count : int
-            Count that it echoes.
+            Count that the message echoes.
         hold : PageHold
-            State of its button.
+            State of the button.
         now : float
-            Time of its arrival [s].
+            Time of arrival [s].
         may_hold : bool
             Whether this page may hold now.
 
         Returns
         -------
         HoldRefusal or None
-            Why it does not count. A release ends the hold in any case.
+            Reason why the message does not count. A release ends the hold in any case.
         """
         self.received_at = now
         sent, refusal = self._check_echo(count, hold, now)
         if not hold.pressed:
             self.end()
-            # Only a fresh release allows that the next press counts.
+            # The next press counts only after a recent release.
             self._armed = refusal is None
             return refusal
         if refusal is None and not may_hold:
@@ -183,8 +183,8 @@ class PageSession:
     def _check_echo(
         self, count: int, hold: PageHold, now: float
     ) -> tuple[float, HoldRefusal | None]:
-        """Return when the echoed count was sent, and why it does not count."""
-        # A page sends a release at once, so it may repeat the last echo.
+        """Return the time at which the echoed count was sent, and the reason to refuse it."""
+        # A page sends a release immediately, so it may repeat the last echo.
         least = self.echoed + 1 if hold.pressed else self.echoed
         if not self._sent or not least <= count <= self._sent[-1][0]:
             return -math.inf, HoldRefusal.ECHO

@@ -1,4 +1,4 @@
-"""Retraction of the needle by a held button: hold and service calls in their order."""
+"""Retraction of the needle while a button is held: sequence of hold and service calls."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from needle_console.hold.page_session import Mode, PageHold
 STOP_STEERING = "plane_controller/stop"
 RETRACT = "device/retract"
 BEGINS_WITHIN = 1.0
-"""A retraction that is not under way after this time has ended, or was not needed [s]."""
+"""Time after which a retraction that is not in progress has ended, or was not needed [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,10 +31,10 @@ class HoldOrder:
 class Retraction:
     """Retracts the needle while a person holds.
 
-    A controller that steers sends its next step as soon as the hold counts, which would first push
-    the needle farther in. So the hold is not passed on before steering has ended. The device
-    accepts `retract` only while a hold counts. Each service is called once per press. After the
-    retraction the hold ends: a button that is still pressed must not insert the needle again.
+    An active controller sends its next step as soon as the hold counts, which would first push the
+    needle farther in. Therefore the hold is not passed on before steering has ended. The device
+    accepts `retract` only while a hold counts. Each service is called once per press. The hold ends
+    after the retraction, because a button that is still pressed must not insert the needle again.
     """
 
     def __init__(self) -> None:

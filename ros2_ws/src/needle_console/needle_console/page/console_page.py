@@ -1,4 +1,4 @@
-"""Page of one browser: built once, then updated."""
+"""Page of one browser, which is built once and then updated."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _HEAD = """
 
 
 class ConsolePage:
-    """The page of the client that NiceGUI serves at the moment.
+    """Page of the client that NiceGUI is currently serving.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class ConsolePage:
         ui.add_head_html(_HEAD.replace("OPTIONS", options))
         ui.dark_mode(None)
         with ui.element("main").classes("console"):
-            # The first in keyboard order; the style sheet places them.
+            # The controls are first in keyboard order; the style sheet positions them.
             self._controls = Controls(port)
             self._status = StatusBar()
             for side in SIDES:
@@ -72,7 +72,7 @@ class ConsolePage:
 
 
 class StatusBar:
-    """The strip above the pictures: states of device and controller, readings, warnings."""
+    """Strip above the pictures with states of device and controller, readings and warnings."""
 
     def __init__(self) -> None:
         with ui.element("section").classes("status").props('aria-label="State"'):

@@ -1,4 +1,4 @@
-"""Controls of a page: buttons, hold, speed, stop, targets."""
+"""Controls of a page: buttons, hold, speed, stop and targets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SET_SPEED = "(value) => window.needleHold && window.needleHold.setSpeed(value /
 
 
 class Controls:
-    """The column of controls.
+    """Column of controls.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Controls:
     """
 
     SPEED = 0.5
-    """Share of the nominal speed on a new page."""
+    """Initial share of the nominal speed on a page."""
 
     def __init__(self, port: PagePort) -> None:
         self._port = port
@@ -74,7 +74,7 @@ class Controls:
             usable = button in possible and not self._bar
             if button not in _HOLDS:
                 element.set_enabled(usable)
-            # A hold button that is pressed must not change: hold buttons are never disabled.
+            # Hold buttons are never disabled, because one may be pressed at the moment.
             _mark(element, "dim", not usable)
             _mark(element, "again", must_release and button in _HOLDS)
             _mark(element, "next", button is advice.button and usable)
@@ -90,7 +90,7 @@ class Controls:
                     # page.js writes the status of the hold here.
                     ui.element("div").props('id="hold-words"')
             self._buttons[button] = hold
-        # Grey, with a plain label: it is no emergency stop (docs/safety.md).
+        # Grey, with a plain label, because it is not an emergency stop (docs/safety.md).
         stop = ui.button(
             Button.STOP.value, color="grey-7", on_click=lambda: port.press(Button.STOP)
         )

@@ -18,7 +18,7 @@ from needle_console.view.space import (
     to_view,
 )
 
-_LENGTH = 0.12  # of the drawn plane [m]
+_LENGTH = 0.12  # length of the drawn plane [m]
 _HALF_WIDTH_MM, _MESH_MM = 20.0, 10.0
 _SHAFT_MM, _TARGET_MM = 0.6, 1.5
 # A smaller ellipsoid would be invisible.
@@ -26,7 +26,7 @@ _MIN_RADIUS_MM = 0.8
 
 
 class NeedleScene:
-    """The 3D view; it sends only changes to the browser."""
+    """3D view that sends only changes to the browser."""
 
     def __init__(self) -> None:
         self._pieces: list[tuple[tuple[float, ...], Any]] = []
@@ -103,7 +103,7 @@ class NeedleScene:
 
 
 def _grid(scene: Any) -> Any:
-    """Draw a plane as lines: a filled one would hide what is behind it."""
+    """Draw a plane as lines, because a filled one would hide the objects behind it."""
     half, steps = 0.5 * _LENGTH * 1e3, int(_LENGTH * 1e3 / _MESH_MM)
     with scene.group() as grid:
         for x in np.linspace(-half, half, steps + 1):
@@ -117,7 +117,7 @@ def _grid(scene: Any) -> Any:
 
 
 def _piece(scene: Any, ends: Array) -> Any:
-    """Draw a straight piece of the shaft: a cylinder, whose axis is its own y."""
+    """Draw a straight piece of the shaft as a cylinder, whose axis is its local y."""
     along = ends[1] - ends[0]
     length = float(np.linalg.norm(along))
     y = along / length if length > 0.0 else np.array([0.0, 1.0, 0.0])

@@ -29,14 +29,14 @@ from needle_tracker.optics.refraction import stereo_views
 
 
 class PagePort:
-    """Connects the threads of page and hold with the runner of the component; never blocks.
+    """Connects the threads of page and hold with the component's runner, without blocking.
 
     Parameters
     ----------
     settings : ConsoleParameters
         The component's parameters.
     clock : callable
-        Returns the steady time of the wall clock, also in a simulation [s].
+        Returns the monotonic real time [s], also in a simulation.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class PagePort:
     # ---- for the component's runner -------------------------------------------------------------
 
     def open(self, arrive: Callable[[Batch], None]) -> None:
-        """Begin to pass events on."""
+        """Pass events to `arrive` from now on."""
         self._arrive = arrive
 
     def send(self, batch: Sequence[PageUpdate]) -> None:
@@ -79,8 +79,8 @@ class PagePort:
     def _take(self) -> tuple[PageEvent, ...]:
         """Return the events since the last call.
 
-        The newest hold counts, unless one was a release; the next one follows soon. The age of a
-        hold is measured on the wall clock: an old one does not count, even if a simulation is slow.
+        The newest hold counts, unless one of them was a release; the next one follows soon. The age
+        of a hold is measured in real time: an old one does not count, even in a slow simulation.
         """
         with self._lock:
             events, self._events = self._events, []
@@ -99,14 +99,14 @@ class PagePort:
     # ---- for the hold's thread ------------------------------------------------------------------
 
     def set_hold(self, hold: PageHold) -> None:
-        """Set the hold that counts."""
+        """Set the valid hold."""
         with self._lock:
             self._hold, self._hold_at = hold, self._clock()
             self._was_released |= not hold.pressed
         self._arrive(self._take)
 
     def why_no_hold(self, is_local: bool) -> str:
-        """Return why a page may only watch and stop; `is_local`: on the rig's own machine."""
+        """Return the reason why a page, `is_local` or remote, may only watch and stop, if any."""
         device = self._snapshot.device
         simulated = None if device is None else device.simulated
         return self._settings.why_no_hold(simulated, is_local=is_local)
@@ -132,7 +132,7 @@ class PagePort:
 
     def send_plane(self, pose: Array) -> None:
         """Send a target plane, T_rig_plane, shape (4, 4)."""
-        # The stamp is 0: the pose was not measured.
+        # The stamp is 0, because the pose was not measured.
         orientation = quaternion_from_rotation(pose[:3, :3].tolist())
         self._add(Pose(0, "rig", _vector(pose[:3, 3]), orientation))
 

@@ -21,12 +21,12 @@ from needle_core.component import Batch
 from needle_core.errors import UserError
 
 STATIC = Path(__file__).resolve().parents[1] / "static"
-# Time for open connections at the end, and for the thread [s].
+# Time limits for closing open connections, and for the end of the thread [s].
 _SHUTDOWN_TIMEOUT, _JOIN_TIMEOUT = 0.2, 1.0
 
 
 class WebServer:
-    """Server of the page; a process has only one, as NiceGUI is a singleton.
+    """Server of the page; a process can have only one, because NiceGUI is a singleton.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class WebServer:
     Raises
     ------
     UserError
-        The port is taken, or the address is none of this machine's.
+        If the port is taken, or the address does not belong to this machine.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class WebServer:
 
 
 class ServedPagePort(PagePort):
-    """The port with the servers of page and hold.
+    """Port with the servers of page and hold.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class ServedPagePort(PagePort):
     Raises
     ------
     UserError
-        An invalid setting, or a port that is taken.
+        If a setting is invalid, or a port is taken.
     """
 
     def __init__(self, settings: ConsoleParameters) -> None:

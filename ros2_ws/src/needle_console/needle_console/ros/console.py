@@ -23,7 +23,7 @@ Calls       device/{confirm_needle_out,home,enable,stop,retract,reset},
 
 
 def main() -> int:
-    """Run the console; returns its exit code."""
+    """Run the console; return its exit code."""
     if importlib.util.find_spec("nicegui") is None:
         print("error: NiceGUI is not installed; scripts/console installs it", file=sys.stderr)
         return EXIT_BAD_INPUT

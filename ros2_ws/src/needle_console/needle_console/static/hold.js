@@ -1,7 +1,7 @@
 // Hold to run over a WebSocket: 50 times a second, the page echoes the server's count with the state
 // of the button. It sends a release at once. The server alone decides what counts (docs/safety.md).
 //
-// The buttons are the elements with data-hold="insert" or data-hold="retract", also later ones.
+// The buttons are all elements with data-hold="insert" or data-hold="retract", even if added later.
 
 const RETRY = 1000; // [ms]
 const SILENCE = 500; // The connection counts as lost after this time without a message [ms].
@@ -17,12 +17,12 @@ class Hold {
   #address;
   #speed = 0;
   #socket = null;
-  // The server's newest count, which each message echoes; 0: none on this connection.
+  // The server's newest count, which each message echoes; 0 before the first on this connection.
   #count = 0;
   // The current press: { mode, button, pointer (null: the space bar), after (the newest count when
   // it began: a later echo includes it), counted (whether it was a hold) }.
   #press = null;
-  // Why the last press ended without a release, until a new one begins; empty: it did not.
+  // Reason why the last press ended without a release, until a new one begins; empty if it did not.
   #ended = "";
   #state = { held: false, bar: "", why: "" };
   #receivedAt = 0;
@@ -53,7 +53,7 @@ class Hold {
   get status() {
     const open = this.#count > 0 && performance.now() - this.#receivedAt < SILENCE;
     return {
-      // Why this page may only watch and stop; empty: it may hold.
+      // Reason why this page may only watch and stop; empty if it may hold.
       bar: open ? this.#state.bar : UNCONNECTED,
       held: open && this.#state.held && this.#press !== null,
       mode: this.#press ? this.#press.mode : "insert",
@@ -102,7 +102,7 @@ class Hold {
     );
   }
 
-  // Return why the press must end although no event reported it, as for a removed button.
+  // Return the reason to end the press although no event reported it, as for a removed button.
   #interruption() {
     const { button } = this.#press;
     if (!button.isConnected || buttonOf(button) !== button) return "its button was switched off";
@@ -149,7 +149,7 @@ class Hold {
     on(window, "pagehide", hide);
     on(document, "visibilitychange", hide);
     on(document, "freeze", hide);
-    // A long touch must not open a menu. And after a touch that may become a scroll, Chromium delays
+    // A long touch must not open a menu. After a touch that may become a scroll, Chromium also delays
     // socket messages by 100 ms, which would end the hold.
     for (const type of ["touchstart", "contextmenu", "dragstart"]) {
       const prevent = (event) => {
@@ -216,7 +216,7 @@ class Hold {
   }
 }
 
-// Return the hold button that contains an element; null: none, or a disabled one.
+// Return the hold button that contains an element; null if there is none, or it is disabled.
 function buttonOf(element) {
   const button = element instanceof Element ? element.closest("[data-hold]") : null;
   return button && !button.matches(":disabled, [aria-disabled=true], .disabled") ? button : null;

@@ -9,7 +9,7 @@ import math
 from needle_console.view.snapshot import Snapshot, stop_reason
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-# The needle is out if the insertion is smaller [m].
+# The needle counts as out if the insertion is smaller than this [m].
 _OUT = 1e-4
 STEERING = ("STEERING", "WAITING_FOR_TIP")
 """States in which the controller steers."""
@@ -36,11 +36,11 @@ class Advice:
     Attributes
     ----------
     headline : str
-        The situation.
+        Current situation.
     text : str
-        The next step.
+        Next step.
     button : Button or None
-        Button of the next step; None: it needs none.
+        Button of the next step; None if it requires none.
     """
 
     headline: str

@@ -1,4 +1,4 @@
-"""Camera views with tip, shaft and target, as JPEG; drawn only on request."""
+"""Camera views with tip, shaft and target as JPEG, drawn only on request."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from needle_console.view.snapshot import Array, Snapshot
 from needle_tracker.optics.refraction import RefractedCamera
 
 SIDES = ("left", "right")
-# Shortest period between two drawings of a view [s].
+# Minimum time between two drawings of a view [s].
 PERIOD = 0.1
-# A view is not shown if its image is older [s].
+# A view is not shown if its image is older than this [s].
 _MAX_AGE = 2.0
 
 Image = NDArray[np.uint8]
-# BGR, of Okabe and Ito's palette.
+# BGR, from the palette of Okabe and Ito.
 _BLUE, _ORANGE, _WHITE = (178, 114, 0), (0, 159, 230), (255, 255, 255)
 _WIDTH_PX = 640
 _QUALITY = 80
@@ -30,12 +30,12 @@ _SUB_BITS = 4
 class CameraView:
     """Views of both cameras; any thread may call the methods.
 
-    All times are steady [s].
+    All times are monotonic [s].
 
     Parameters
     ----------
     cameras : mapping of str to RefractedCamera
-        By side; without its camera a side is shown without the needle.
+        Cameras by side; a side without a camera is shown without the needle.
     snapshot : callable
         Returns the newest state of the rig.
     """
@@ -50,7 +50,7 @@ class CameraView:
         self._jpegs: dict[str, tuple[bytes, float]] = {}
 
     def set_image(self, side: str, image: Image, now: float) -> None:
-        """Set the newest image of a side, grey, shape (height, width)."""
+        """Set the newest grey image of a side, shape (height, width)."""
         with self._lock:
             self._images[side] = image, now
 
@@ -77,9 +77,9 @@ def draw_view(image: Image, snapshot: Snapshot, camera: RefractedCamera | None) 
     image : ndarray of uint8, shape (height, width)
         The camera image.
     snapshot : Snapshot
-        With tip, shaft and target point.
+        State of the rig with tip, shaft and target point.
     camera : RefractedCamera or None
-        Projects the points; without it, or for another image size, nothing is drawn.
+        Projects the points; if it is None or has another image size, nothing is drawn.
 
     Returns
     -------

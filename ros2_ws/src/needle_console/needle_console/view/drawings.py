@@ -12,7 +12,7 @@ import numpy as np
 
 from needle_console.view.snapshot import Snapshot
 
-# Of Okabe and Ito's palette, which suits red-green colour blindness.
+# From the palette of Okabe and Ito, which suits red-green colour blindness.
 BLUE, ORANGE, GREY = "#0072b2", "#e69f00", "#8a8f98"
 GOAL_MM = 1.0
 _MM = 1e3
@@ -29,9 +29,9 @@ class _Frame:
     Parameters
     ----------
     depth : float
-        Depth at the right edge [mm]; at the left edge it is 0.
+        Depth at the right edge [mm]; the left edge is at 0.
     limit : float
-        Distance at the upper edge; at the lower one it is negative [mm].
+        Distance at the upper edge, and its negative at the lower edge [mm].
     """
 
     def __init__(self, depth: float, limit: float) -> None:
@@ -130,7 +130,7 @@ def dial(rotation: float) -> str:
     Parameters
     ----------
     rotation : float
-        Of the base [rad]; NaN draws no pointer.
+        Rotation of the base [rad]; NaN draws no pointer.
     """
     pointer = ""
     if math.isfinite(rotation):

@@ -1,4 +1,4 @@
-"""Collects messages of the rig, and returns snapshots of its state."""
+"""Collection of the rig's messages into snapshots of its state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from needle_core.diagnostics import sanitize
 from needle_core.messages import Vector3
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-# Estimates that are closer together are merged [m].
+# Estimates that are closer together than this are merged [m].
 SPACING = 2.5e-4
 MAX_POINTS = 1000
 JOINTS_TIMEOUT = 1.0
@@ -25,7 +25,7 @@ _SAME_OFFSET = 1e-6
 class RigPicture:
     """State of the rig from its messages.
 
-    All times are steady [s].
+    All times are monotonic [s].
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class RigPicture:
         """Set the status of the device."""
         before = self._latest.device
         if before is not None and "(hold_new_press)" in state.reason:
-            # The press continues; the status before has the reason why it no longer counts.
+            # The press continues; the previous status has the reason why it no longer counts.
             state = dataclasses.replace(state, reason=stop_reason(before) or state.reason)
         self._update(device=state)
 
@@ -74,7 +74,7 @@ class RigPicture:
         )
 
     def clear_controller(self) -> None:
-        """Discard the status of a controller that is gone."""
+        """Discard the status of a controller that has ended."""
         self._update(controller=None)
 
     def set_joints(self, insertion: float, rotation: float, now: float) -> None:
@@ -89,11 +89,11 @@ class RigPicture:
         Parameters
         ----------
         position : ndarray, shape (3,)
-            In `rig` [m].
+            Position in `rig` [m].
         covariance : ndarray, shape (3, 3)
-            Of the position [m^2].
+            Covariance of the position [m^2].
         now : float
-            Time of its arrival.
+            Time of arrival [s].
         """
         if np.isfinite(position).all() and np.isfinite(covariance).all():
             self._tip_at = now
@@ -108,9 +108,9 @@ class RigPicture:
         Parameters
         ----------
         position : ndarray, shape (3,)
-            r1, y and z [m].
+            Coordinates r1, y and z [m].
         covariance : ndarray, shape (3, 3)
-            Of the position [m^2].
+            Covariance of the position [m^2].
         """
         if not (np.isfinite(position).all() and np.isfinite(covariance).all()):
             return
@@ -142,11 +142,11 @@ class RigPicture:
             self._latest = dataclasses.replace(self._latest, T_rig_plane=plane)
 
     def set_proposal(self, point: Vector3 | None) -> None:
-        """Set the target point that a planner proposes, in `rig` [m]; None: withdrawn."""
+        """Set the target point that a planner proposes, in `rig` [m]; None if it is withdrawn."""
         self._update(proposed_point=point)
 
     def set_health(self, name: str, *, bad: bool, message: str, now: float) -> None:
-        """Set one status of /diagnostics: `node: part`, whether it is a warning, and its text."""
+        """Set one status from /diagnostics; `name` is `node: part`, `bad` marks a warning."""
         self._warnings.pop(name, None)
         if bad:
             self._warnings[name] = (f"{sanitize(name)}: {sanitize(message, 160)}", now)

@@ -1,4 +1,4 @@
-"""State of the rig at one moment, as a page shows it."""
+"""State of the rig at one moment, as shown on a page."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class MeasuredTip:
     Attributes
     ----------
     position : ndarray, shape (3,)
-        In `rig` [m].
+        Position in `rig` [m].
     covariance : ndarray, shape (3, 3)
-        Of the position [m^2].
+        Covariance of the position [m^2].
     age : float
-        Since its message arrived [s].
+        Time since its message arrived [s].
     """
 
     position: Array
@@ -47,9 +47,9 @@ class TrackPoint:
     r1, sigma : float
         Signed distance of the tip from the target plane, and its standard deviation [m].
     position : ndarray, shape (3,)
-        Of the tip in `rig` [m].
+        Position of the tip in `rig` [m].
     covariance : ndarray, shape (3, 3)
-        Of the position, in `rig` [m^2].
+        Covariance of the position, in `rig` [m^2].
     """
 
     depth: float
@@ -66,19 +66,19 @@ class Snapshot:
     Attributes
     ----------
     device, controller : DeviceStatus, ControllerStatus, or None
-        Their last status; None: not received.
+        Last status of each; None if none was received.
     insertion, rotation : float
-        The joints [m], [rad]; NaN: not received for a second.
+        Joint positions [m], [rad]; NaN if none was received within the last second.
     tip : MeasuredTip or None
         The last measured tip.
     tip_lost_for : float
-        Time since the cameras lost the tip [s]; 0: they did not.
+        Time since the cameras lost the tip [s]; 0 if they have not lost it.
     T_rig_plane : ndarray, shape (4, 4)
-        The target plane's frame [m].
+        Frame of the target plane [m].
     track : tuple of TrackPoint
         Estimates since the start, by increasing depth.
     warnings : tuple of str
-        Warnings of nodes in /diagnostics.
+        Current warnings from /diagnostics.
     answer : str
         Answer of the last service call.
     proposed_point : tuple of float, or None
@@ -106,5 +106,5 @@ class Snapshot:
 
 
 def stop_reason(device: DeviceStatus) -> str:
-    """Return the fault of a device, or why it last stopped, refused or waits; empty: none."""
+    """Return a device's fault, or the reason for its last stop, refusal or wait; empty if none."""
     return device.fault or device.reason

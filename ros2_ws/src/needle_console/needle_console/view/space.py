@@ -17,7 +17,7 @@ _PIECE = 2e-3
 
 
 def to_view(points: Array) -> Array:
-    """Return points of `rig` [m], shape (..., 3), in the view [mm]."""
+    """Transform points from `rig` [m] to the view [mm], shape (..., 3)."""
     return np.asarray(points @ R_VIEW_RIG.T * _MM)
 
 
@@ -58,7 +58,7 @@ def ellipsoid(snapshot: Snapshot) -> tuple[Array, Array, Array] | None:
 def plane_rotation(snapshot: Snapshot) -> Array:
     """Return the rotation of a flat box (thin along z) into the target plane, (3, 3)."""
     R = snapshot.T_rig_plane[:3, :3]  # noqa: N806
-    # The box's x is the plane's z, its z the plane's normal.
+    # The box's x axis is the plane's z axis, and its z axis is the plane's normal.
     return np.asarray(R_VIEW_RIG @ R @ R_VIEW_RIG.T)
 
 

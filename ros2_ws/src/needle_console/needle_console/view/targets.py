@@ -1,4 +1,4 @@
-"""Checks targets in mm and degrees, as a person types them; converts them to `rig`."""
+"""Checks of targets typed in mm and degrees, and their conversion to `rig`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ LARGEST_OFFSET_MM, LARGEST_TILT_DEG, LARGEST_MM = 50.0, 45.0, 150.0
 
 
 def plane_pose(offset_mm: float, tilt_deg: float) -> Array:
-    """Return the frame of a plane above the entry that rises inwards.
+    """Return the frame of a plane above the entry that rises along the insertion.
 
     Parameters
     ----------
     offset_mm : float
         Height of the plane above the entry, along its normal.
     tilt_deg : float
-        Angle by which it rises along the insertion.
+        Angle by which the plane rises along the insertion.
 
     Returns
     -------
@@ -30,7 +30,7 @@ def plane_pose(offset_mm: float, tilt_deg: float) -> Array:
     Raises
     ------
     UserError
-        A number that is not finite or out of bounds.
+        If a number is not finite or out of bounds.
     """
     check_bounds("offset", offset_mm, -LARGEST_OFFSET_MM, LARGEST_OFFSET_MM, "mm")
     check_bounds("tilt", tilt_deg, -LARGEST_TILT_DEG, LARGEST_TILT_DEG, "deg")
@@ -48,7 +48,7 @@ def target_point(x_mm: float, y_mm: float, z_mm: float) -> Array:
     Raises
     ------
     UserError
-        A number that is not finite or out of bounds.
+        If a number is not finite or out of bounds.
     """
     for name, value in (("x", x_mm), ("y", y_mm)):
         check_bounds(name, value, -LARGEST_MM, LARGEST_MM, "mm")

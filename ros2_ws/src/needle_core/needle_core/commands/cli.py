@@ -58,7 +58,7 @@ def run_command(command: Callable[[], int]) -> int:
 
 
 def internal_error(error: Exception) -> int:
-    """Print an internal error and its place in one line; return its exit code.
+    """Print an internal error and its location in one line; return its exit code.
 
     Python's development mode (PYTHONDEVMODE=1) prints the traceback as well.
     """

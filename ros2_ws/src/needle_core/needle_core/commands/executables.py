@@ -1,7 +1,7 @@
 """Entry points of a package's executables: signals, environment and import before `main`.
 
-Loading ROS, numerical code and image processing takes up to seconds, and a signal may arrive
-meanwhile. Therefore this module imports nothing slow, and modules are given by name.
+Loading ROS, numerical code and image processing may take seconds, and a signal may arrive in the
+meantime. Therefore this module imports nothing slow, and modules are given by name.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def node(module: str) -> Callable[[], NoReturn]:
         use_fast_dds()
         code: int = load(module).main()
         # Skip the interpreter's shutdown: clean-up of DDS and numerical libraries may hang or
-        # crash there, and signals are not handled any more.
+        # crash there, and signals are no longer handled.
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):
                 stream.flush()

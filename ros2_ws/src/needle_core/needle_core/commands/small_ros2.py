@@ -34,7 +34,7 @@ def main() -> int:
             case ["run", package, executable, *arguments]:
                 found = _find("package", package, _executables())
                 entry = _find(f"executable of {package}", executable, found)
-                # In this process, so that signals reach it and its exit code is that of `ros2`.
+                # Run it in this process, so that it receives signals and sets the exit code.
                 sys.argv = [executable, *arguments]
                 sys.exit(entry.load()())
             case ["pkg", "executables", *given]:

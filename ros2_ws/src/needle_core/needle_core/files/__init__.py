@@ -1,1 +1,1 @@
-"""Files from outside: read within bounds, checked, and replaced whole."""
+"""Access to external files, with bounds, checks and atomic replacement."""

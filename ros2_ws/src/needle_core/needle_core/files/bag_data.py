@@ -1,4 +1,4 @@
-"""Data files of a bag other than plain MCAP: SQLite, and compression by file or by message."""
+"""Bag data other than plain MCAP: SQLite files, and compressed files or messages."""
 
 from __future__ import annotations
 

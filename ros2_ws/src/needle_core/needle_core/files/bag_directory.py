@@ -1,4 +1,4 @@
-"""Rosbag2 directory: its content agrees with its metadata, or opening it is an error."""
+"""Rosbag2 directory; opening it fails if its content does not agree with its metadata."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class BagDirectory:
     Attributes
     ----------
     topics : dict of str to BagTopic
-        By name.
+        Topics by name.
     counts : dict of str to int
         Number of messages by topic.
     custom_data : dict of str to str
@@ -73,7 +73,7 @@ class BagDirectory:
     records : list of Metadata
         Metadata records of a single MCAP file.
     is_compressed : bool
-        Whether any message read so far was compressed by itself.
+        Whether any message read so far was compressed individually.
     """
 
     def __init__(self, path: Path) -> None:
@@ -155,7 +155,7 @@ class BagDirectory:
             raise ValueError(f"{METADATA_FILE} has version {version!r}")
         try:
             kind = self._require_known(information)
-            # Old versions put the bag's name in front.
+            # Old versions prefix the file names with the bag's name.
             names = [PurePath(name).name for name in information["relative_file_paths"]]
             self._files = [self._open(self.path / name, kind) for name in names]
             custom = information.get("custom_data") or {}

@@ -1,4 +1,4 @@
-"""Paths of bags: recognises bags and their files, and explains why one cannot be read."""
+"""Detection of bags and their files, and errors that explain why a bag cannot be read."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def repair_hint(path: Path) -> str:
 def recording_files(folder: Path) -> list[Path]:
     """Return the files of a folder's only MCAP recording: `<stem>.mcap` or `<stem>_<n>.mcap`.
 
-    Of several stems, the one with the folder's name is the recording. If numbers are missing in
-    the sequence, the result includes the first missing file, which does not exist.
+    If there are several stems, the one with the folder's name is the recording. If numbers are
+    missing in the sequence, the result includes the first missing file, which does not exist.
 
     Raises
     ------

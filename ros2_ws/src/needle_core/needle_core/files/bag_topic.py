@@ -73,7 +73,7 @@ class BagTopic:
         return any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in self.offered_qos)
 
 
-# Parsing the definitions of a rig takes 0.2 s, and a bag is read several times.
+# Sizes of the caches: parsing a rig's definitions takes 0.2 s, and a bag is read several times.
 _STORES_KEPT: Final = 4
 _PARTS_KEPT: Final = 256
 _NEXT_TYPE: Final = re.compile(r"^={80}\nMSG: ", re.MULTILINE)
@@ -99,7 +99,7 @@ def _types_of_part(text: str, type_name: str) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=_STORES_KEPT)
 def typestore_of(definitions: tuple[tuple[str, str, str, str], ...]) -> Typestore:
-    """Return the type store of definitions, each given by encoding, text, type and hash."""
+    """Return the type store of definitions, each given as encoding, text, type and hash."""
     if not definitions:
         return get_typestore(Stores.ROS2_JAZZY)
     store = get_typestore(Stores.EMPTY)

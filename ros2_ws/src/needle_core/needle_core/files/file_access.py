@@ -1,4 +1,4 @@
-"""Access to regular files: reading without blocking, and atomic replacement; links are refused."""
+"""Access to regular files, but not links: reading without blocking, and atomic replacement."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MCAP file, read with the mcap library: all that was recorded, or an error.
+"""Reader of MCAP files: returns every recorded message, or raises an error.
 
 The format: https://mcap.dev/spec.
 """
@@ -26,7 +26,7 @@ TIME_LIMIT: Final = 2**63
 
 
 class BrokenMcapError(Exception):
-    """MCAP file without an index, or with other content than its index."""
+    """MCAP file without an index, or whose content differs from its index."""
 
 
 class McapFile:
@@ -148,8 +148,8 @@ RUN_RECORD: Final = "needle_run"
 def custom_data_of(records: Iterable[Metadata]) -> dict[str, str]:
     """Return the `custom_data` of a recording from the metadata records in its files.
 
-    Our recorder writes one record of the run at its start, one for every node's parameters and for
-    every change of them, and, like rosbag2, the whole metadata.yaml at the end.
+    The recorder writes one record about the run at its start, one for each node's parameters, one
+    for each change of a parameter, and at the end, like rosbag2, the whole metadata.yaml.
     """
     custom: dict[str, str] = {}
     parameters: dict[str, Any] = {}

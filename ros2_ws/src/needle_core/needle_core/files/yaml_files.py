@@ -1,4 +1,4 @@
-"""YAML files, calibration files among them: duplicate keys are errors, an error is one line."""
+"""YAML and calibration files: duplicate keys are errors, and every error is one line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from needle_core.errors import UserError
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Rejects duplicate keys, whose second value would silently replace the first."""
+    """YAML loader that rejects duplicate keys, as the second would silently replace the first."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
         keys: set[str] = set()
@@ -72,7 +72,7 @@ def read_text(path: Path) -> str:
 
 
 def foreign_format(text: str) -> str:
-    """Return the other tool that wrote a calibration: ROS, KALIBR, OPENCV or empty."""
+    """Return which other tool wrote a calibration: ROS, KALIBR, OPENCV, or empty for none."""
     found = (kind for kind, sign in _SIGNS.items() if re.search(sign, text, re.MULTILINE))
     return next(found, "")
 

@@ -8,7 +8,7 @@ from typing import Protocol
 from needle_core.ports.reopening_port import ReopeningPort
 
 MAX_CHUNK = 65536
-"""Bytes that are read from a stream at a time."""
+"""Maximum number of bytes per read."""
 
 
 class ByteStream(Protocol):
@@ -25,7 +25,7 @@ class ByteStream(Protocol):
 
 
 class TcpStream:
-    """TCP connection as a `ByteStream`; a read or write waits for `timeout` [s] at most."""
+    """TCP connection as a `ByteStream`; a read or write waits at most `timeout` [s]."""
 
     def __init__(self, connection: socket.socket, timeout: float) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -22,7 +22,7 @@ class ReopeningPort(abc.ABC, Generic[D]):
     Parameters
     ----------
     errors : tuple of type
-        Errors of the device, when it is opened or written to.
+        Exceptions that opening the device or writing to it may raise.
     """
 
     def __init__(self, errors: tuple[type[Exception], ...] = (OSError,)) -> None:
@@ -40,12 +40,12 @@ class ReopeningPort(abc.ABC, Generic[D]):
         self._thread.start()
 
     def begin(self, arrive: Callable[[Any], None]) -> None:
-        """Open the device without the thread; the caller calls `step`."""
+        """Open the device without starting the thread; the caller calls `step` instead."""
         self._arrive = arrive
         self._try_to_open()
 
     def send(self, batch: tuple[Any, ...]) -> None:
-        """Send a batch; without a device it is dropped, and an error loses the device."""
+        """Send a batch, or drop it if no device is open; an error closes the device."""
         with self._lock:
             device = self._device
             if device is None:
@@ -73,7 +73,7 @@ class ReopeningPort(abc.ABC, Generic[D]):
         try:
             if batch := self._read(device):
                 self._arrive(batch)
-        # Libraries of devices raise whatever their operating system raises.
+        # Device libraries also raise exceptions other than the declared ones.
         except Exception as error:  # noqa: BLE001
             with self._lock:
                 if self._device is device:
@@ -89,7 +89,7 @@ class ReopeningPort(abc.ABC, Generic[D]):
 
     @abc.abstractmethod
     def _write(self, device: D, batch: tuple[Any, ...]) -> None:
-        """Write a batch, in at most the time of a cycle."""
+        """Write a batch within the duration of one cycle."""
 
     @abc.abstractmethod
     def _close_device(self, device: D) -> None:
@@ -125,9 +125,9 @@ class ReopeningPort(abc.ABC, Generic[D]):
 
 
 def _error_text(error: Exception) -> str:
-    """Return one line on an error: the operating system's text if there is one."""
+    """Return a one-line description of an error: the operating system's text if there is one."""
     for cause in (error, error.__cause__, error.__context__):
-        # A host name that is not found has a negative number of its own.
+        # Failed host name look-ups have negative numbers that strerror does not know.
         if isinstance(cause, OSError) and cause.errno and cause.errno > 0:
             return os.strerror(cause.errno)
     return str(error).partition("\n")[0]

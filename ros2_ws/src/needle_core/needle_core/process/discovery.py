@@ -16,7 +16,7 @@ THIS_MACHINE = Path(__file__).with_name("needle_fastdds.xml")
 NETWORK = Path(__file__).with_name("needle_fastdds_network.xml")
 THIS_MACHINE_UDP = Path(__file__).with_name("needle_fastdds_udp.xml")
 NETWORK_UDP = Path(__file__).with_name("needle_fastdds_network_udp.xml")
-# Time to discover a device on another machine before anything starts [s].
+# Time allowed to discover a device on another machine before the start [s].
 DISCOVERY = 2.0
 
 _LOCALHOST, _OFF = "LOCALHOST", "OFF"
@@ -27,7 +27,7 @@ _RMW, _FAST_DDS = "RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"
 
 
 def use_fast_dds(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Replace another middleware and print a warning; call it before ROS is loaded."""
+    """Select Fast DDS, with a warning if another one was set; call this before loading ROS."""
     given = environment.get(_RMW) or _FAST_DDS
     if given != _FAST_DDS:
         print(f"{_RMW}={given} ignored: the rig's nodes run on {_FAST_DDS}", file=sys.stderr)
@@ -87,8 +87,8 @@ def restrict_discovery(
 ) -> None:
     """Limit discovery to this machine, unless the user's discovery range asks for a network.
 
-    A profile file of the user stays, unless it does not exist, which would enable the network. The
-    function calls `clean_environment` first.
+    A profile file set by the user stays in effect if it exists; a missing one would enable the
+    network. The function calls `clean_environment` first.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Names that only one process of a machine holds, among them a ROS domain."""
+"""Names that only one process per machine can hold, such as a ROS domain."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _NAMES = Path("/proc/net/unix")
 class Claim:
     """Exclusive name on this machine, until it is released or collected, or the process ends.
 
-    Discovery takes up to seconds, and two processes that start together do not know each other
-    yet. A name in the kernel is exclusive at once, and free as soon as its process ends.
+    Discovery may take seconds, so two processes that start together have not discovered each other
+    yet. A socket name is exclusive at once, and free as soon as its process ends.
 
     Parameters
     ----------
     name : str
         Name to claim.
     holder : str
-        Name of the holder, for the error message of others.
+        Name of the holder, for the error messages of other processes.
 
     Raises
     ------
@@ -45,7 +45,7 @@ class Claim:
         claimed = _bound(key)
         if claimed is None:
             raise UserError(f"{_holder_of(key)} has {name}")
-        # The kernel lists the names of all sockets, so this one can name the holder.
+        # The kernel lists the names of all sockets, so a second one can show who holds the first.
         label = _bound(f"{key}:{holder} (process {os.getpid()})")
         self._release = weakref.finalize(self, _close, claimed, label)
 
@@ -76,13 +76,13 @@ def _holder_of(key: str) -> str:
     return next(filter(None, labels), "another process")
 
 
-# Above 101 the ports overlap with those of outgoing connections in Linux; 0 is the default domain.
+# 0 is the default domain; above 101, ports overlap with those of outgoing connections in Linux.
 DOMAINS = range(1, 100)
 # RTPS: discovery port of the first participant in domain 0.
 PORT_BASE = 7400
 PORTS_PER_DOMAIN = 250
 FIRST_PARTICIPANT = 10
-# Number of participants to look for: the first ones may have ended before the others.
+# Number of participants to probe for: the first ones may have ended before the others.
 PARTICIPANTS = 40
 
 

@@ -20,14 +20,14 @@ from pathlib import Path
 SHARED_MEMORY = Path("/dev/shm")
 _PREFIX = "fastrtps_"
 _PORT = re.compile(rf"{_PREFIX}port\d+")
-# First word of a segment (Boost) that is not initialised, or being initialised.
+# First word of a Boost segment that is uninitialised or being initialised.
 _INCOMPLETE = (0, 1)
 # Creation takes less than a millisecond, but the process may have to wait for the CPU [s].
 _CREATION_TIME = 1.0
 
 
 def dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
-    """Return the names of the shared-memory ports on which no living process listens.
+    """Return the names of the shared-memory ports on which no running process listens.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
 
 
 def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> None:
-    """Remove the ports on which no living process listens, except those of other users.
+    """Remove the ports on which no running process listens, except those of other users.
 
     Parameters
     ----------

@@ -20,8 +20,9 @@ _DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)
 class ShutdownFlag:
     """Flag that SIGINT, SIGTERM and SIGHUP set within a `with` block.
 
-    A signal raises no exception and shuts no context down, so it interrupts neither compiled code
-    nor the last messages; further signals have no effect. An ignored SIGHUP (nohup) stays ignored.
+    A signal neither raises an exception nor shuts the ROS context down, so that compiled code and
+    the last messages complete; further signals have no effect. An ignored SIGHUP (nohup) stays
+    ignored.
 
     Attributes
     ----------
@@ -62,7 +63,7 @@ class ExitOnSignal:
 
 
 def _handle(handler: _Handler) -> dict[signal.Signals, Any]:
-    """Set the handler, also for a SIGINT that a background job ignores; return the old ones."""
+    """Set the handler, even for a SIGINT ignored by a background job; return the old handlers."""
     return {
         number: signal.signal(number, handler)
         for number in ENDING_SIGNALS
@@ -75,7 +76,7 @@ def interruptible() -> Iterator[None]:
     """Raise KeyboardInterrupt within a `with` block when a signal of `ENDING_SIGNALS` arrives.
 
     Further signals within a second are ignored, because a terminal and a script may both forward
-    the same signal during the clean-up. Handlers that were set before stay.
+    the same signal during the clean-up. Custom handlers that were set before are kept.
     """
     raised = -math.inf
 

@@ -28,8 +28,8 @@ def start_worker(prepare: Callable[..., None], *arguments: Any) -> ProcessPoolEx
     """
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(1, context, _begin, (prepare, *arguments))
-    # The worker inherits the blocked signals from its first moment: a signal to the process group
-    # ends the parent in an orderly way, which then ends the worker.
+    # The worker starts with these signals blocked: a signal to the process group must end only the
+    # parent, which then ends the worker.
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     pool.submit(int)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)

@@ -24,15 +24,15 @@ STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 _TYPES = rclpy_types()
 _CONVERTER = Converter(_TYPES)
 _MAX_TEXT_LENGTH = 200
-# Name that the graph reports for a node whose endpoint is known and whose name is not yet.
+# Name that the graph reports for a node while only its endpoint has been discovered.
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 _NAMELESS = "a node of yet unknown name"
 
 
 class _DestroyedOnFailure(type):
-    """Destroys a node whose construction fails.
+    """Metaclass that destroys a node whose construction fails.
 
-    Otherwise other nodes would discover it for as long as the error's traceback keeps it alive.
+    Otherwise the error's traceback would keep it alive, and other nodes would discover it.
     """
 
     def __call__(cls: Any, *args: Any, **kwargs: Any) -> Any:
@@ -40,7 +40,7 @@ class _DestroyedOnFailure(type):
         try:
             node.__init__(*args, **kwargs)
         except BaseException:
-            # The attribute is missing if the failure precedes rclpy's own construction.
+            # Attributes are missing if rclpy's own constructor has not run yet.
             with contextlib.suppress(AttributeError):
                 node.destroy_node()
             raise
@@ -60,7 +60,7 @@ def full_name(namespace: str, name: str) -> str:
 
 
 def signature(node: Node) -> str:
-    """Return the name of a node in its diagnostics: its full name without the first slash."""
+    """Return the name of a node in its diagnostics: its full name without the leading slash."""
     return str(node.get_fully_qualified_name()).lstrip("/")
 
 
@@ -133,7 +133,7 @@ class DiagnosticsPublisher:
         self._logged: set[tuple[str, str]] = set()
         self._parts: dict[str, Diagnostic] = {}
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
-        # On the steady clock, because diagnostics continue while simulated time stands still.
+        # Use the steady clock, so that diagnostics continue while simulated time is paused.
         node.create_timer(1.0, lambda: self._publish(self._parts), clock=STEADY_CLOCK)
 
     def set(self, part: str, diagnostic: Diagnostic) -> None:
@@ -145,16 +145,16 @@ class DiagnosticsPublisher:
             self._publish([part])
 
     def reject(self, source: str, kind: str, why: str) -> None:
-        """Count and report, as part `input`, a message or request that the node cannot use.
+        """Count an unusable message or request, and report it under the part `input`.
 
         Parameters
         ----------
         source : str
             Topic or service.
         kind : str
-            Kind of problem; the first of each kind is logged.
+            Kind of problem; only the first of each kind is logged.
         why : str
-            The problem itself.
+            Description of the problem.
         """
         text = f"{source}: refused: {why}"[:_MAX_TEXT_LENGTH]
         self._rejections[source] += 1

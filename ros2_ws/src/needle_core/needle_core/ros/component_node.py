@@ -61,7 +61,7 @@ _PEERS_PERIOD = 0.2
 
 
 class ComponentNode(WholeNode):
-    """Delivers messages and time to a component, and executes its actions.
+    """Node that delivers messages and time to a component, and executes its actions.
 
     Parameters
     ----------
@@ -70,9 +70,9 @@ class ComponentNode(WholeNode):
     parameters : type
         Settings dataclass of the component: the parameters of the node.
     make : callable
-        Returns the component for its settings and the node's full name.
+        Returns the component, given its settings and the node's full name.
     ports : callable
-        Returns the real ports of the component for its settings, by name.
+        Returns the component's real ports by name, given its settings.
     node_arguments : dict
         Further arguments of rclpy's Node (context, parameter overrides).
 
@@ -90,7 +90,7 @@ class ComponentNode(WholeNode):
     Raises
     ------
     UserError
-        A parameter that is unknown, of the wrong type, out of bounds or inconsistent with others.
+        If a parameter is unknown, of the wrong type, out of bounds or inconsistent with others.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class ComponentNode(WholeNode):
     ) -> None:
         super().__init__(name, **node_arguments)
         self._own = name
-        # A service that answers later must not block other callbacks.
+        # A service whose reply is pending must not block other callbacks.
         self._group = ReentrantCallbackGroup()
         settings = NodeParameters(self, parameters, self._on_parameters).values
         self.component = make(settings, signature(self))
@@ -218,7 +218,7 @@ class ComponentNode(WholeNode):
 
     def _repeat(self, timer: Timer) -> None:
         def run() -> None:
-            # Input of ports precedes the timer.
+            # Handle port input that has arrived before the timer.
             self._handle_arrived()
             self._handle(lambda: timer.handler(self._moment()))
 
@@ -371,6 +371,6 @@ class ComponentNode(WholeNode):
 
 
 def _known(names: Mapping[str, Iterable[str]]) -> dict[str, tuple[str, ...]]:
-    """Return the topics with endpoints, and the node names without the first slash."""
+    """Return the topics that have endpoints, with node names without the leading slash."""
     found = {topic: tuple(sorted(n.lstrip("/") for n in some)) for topic, some in names.items()}
     return {topic: some for topic, some in found.items() if some}

@@ -34,7 +34,7 @@ MAX_LENGTH = 128  # of a printed array or text
 
 
 def spin_until(node: Node, condition: Callable[[], Any], timeout: float, failure: str = "") -> None:
-    """Spin until the condition holds (`bool`: never) or the timeout [s], which may be a failure."""
+    """Spin until a condition holds (`bool` never does); raise any `failure` at the timeout [s]."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() >= end:
@@ -94,7 +94,7 @@ def fill(message: Any, values: Any) -> list[Any]:
 
 
 def _converted(value: Any, type_name: str, stamps: list[Any]) -> Any:
-    """Return a value with messages and floats as the field has them; add the messages' stamps."""
+    """Convert a value to the messages and floats of its field; add the messages' stamps."""
     if isinstance(value, list):
         item_type = re.sub(r"^sequence<|[,<>\[].*$", "", type_name)
         return [_converted(item, item_type, stamps) for item in value]
@@ -102,7 +102,7 @@ def _converted(value: Any, type_name: str, stamps: list[Any]) -> Any:
         message = find_type(type_name, "msg")()
         stamps += fill(message, value)
         return message
-    # Other conversions, such as a text to a number, would rather hide a mistake.
+    # Other conversions, such as a text to a number, could hide a mistake.
     return float(value) if type_name in ("float", "double") and type(value) is int else value
 
 

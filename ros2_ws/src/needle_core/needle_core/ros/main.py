@@ -1,4 +1,4 @@
-"""Runs a node, or a component as a node, until a signal ends it: called by the executables."""
+"""Main loop of the node executables: runs a node or a component until a signal ends it."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from needle_core.settings.parameter_fields import describe
 from needle_core.settings.parameter_files import command_line_sections
 
 _ROS_OPTIONS = ("-p", "--param", "--params-file", "-r", "--remap", "--log-level")
-# A waiting executor does not notice signals, so it wakes up with this period [s].
+# A blocked executor does not notice signals, so it wakes up with this period [s].
 _WAKE_UP_PERIOD = 0.1
-# Time that the node's end waits for acknowledgements of its last messages [s]: after an end by
-# itself (a recorder that was suspended for 4 s acknowledged within 3 s), and after a signal.
+# Time to wait at exit for acknowledgements of the last messages [s]: if the node ends by itself
+# (a recorder that was suspended for 4 s acknowledged within 3 s), and after a signal.
 _ACKNOWLEDGED_WITHIN, _ACKNOWLEDGED_AFTER_SIGNAL = 5.0, 0.5
 
 
@@ -50,7 +50,7 @@ def run_node(
     spin: Callable[[Node, ShutdownFlag], int] | None = None,
     shared_memory: bool = True,
 ) -> int:
-    """Run a node until a signal ends it, or explain it if the command line has `--help`.
+    """Run a node until a signal ends it, or print its help if the command line has `--help`.
 
     Parameters
     ----------
@@ -116,11 +116,11 @@ def run_component(
     parameters : type
         Settings dataclass of the component: the parameters of the node.
     make : callable
-        Returns the component for its settings and the node's full name.
+        Returns the component, given its settings and the node's full name.
     help_text, shared_memory
         As for `run_node`.
     ports : callable
-        Returns the real ports of the component for its settings.
+        Returns the component's real ports, given its settings.
     interrupted : int
         Exit code if a signal ended unfinished work.
 
@@ -155,10 +155,10 @@ def _run(
     except (UserError, ParameterException) as error:
         code = _reject(error)
         if end.requested:
-            # Other nodes end on the same signal, so their absence is not a bad input.
+            # The signal also ends other nodes, so their absence is not bad input.
             code = EXIT_DONE
     except Exception as error:  # noqa: BLE001
-        # If rclpy cannot make the node, its name or namespace is bad.
+        # If rclpy cannot create the node, its name or namespace is invalid.
         is_bad_input = node is None and isinstance(error, rclpy_implementation.RCLError)
         code = _reject(error) if is_bad_input else internal_error(error)
     finally:
@@ -175,7 +175,7 @@ def _run(
 def _wait_for_acknowledgements(node: Node, seconds: float) -> None:
     """Wait until all reliable subscribers have received the node's messages.
 
-    Without this wait, a busy recorder would miss the end of a run unnoticed.
+    Without this wait, a busy recorder could silently miss the end of a run.
     """
     until = time.monotonic() + seconds
     for publisher in node.publishers:
@@ -212,7 +212,7 @@ def _spin_component(interrupted: int, node: Node, end: ShutdownFlag) -> int:
     assert node.exit is not None
     if node.exit.text:
         print(f"{node.get_name()}: {node.exit.text}", file=sys.stderr)
-    # Other nodes end on the same signal, so a failure for lack of them counts as interrupted.
+    # The signal also ends other nodes, so a failure due to their absence counts as interrupted.
     return interrupted if end.requested and node.exit.code else node.exit.code
 
 
@@ -223,7 +223,7 @@ def _spin_until(node: Node, is_done: Callable[[], bool]) -> None:
         while not is_done():
             executor.spin_once(timeout_sec=_WAKE_UP_PERIOD)
     finally:
-        # An executor that outlives the context raises when it is collected.
+        # An executor that outlives the context raises an error when it is garbage-collected.
         executor.shutdown()
 
 

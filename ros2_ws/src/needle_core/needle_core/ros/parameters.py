@@ -1,4 +1,4 @@
-"""Declares a parameter dataclass on a node, and keeps it valid while the node runs."""
+"""Declaration of a parameter dataclass on a node, and checks of changes while it runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ OF_EVERY_NODE = (_SIM_TIME, "start_type_description_service", "qos_overrides.")
 
 
 class NodeParameters(Generic[P]):
-    """Parameters of a node: declared, and changed only to valid combinations.
+    """Declared parameters of a node; changes to invalid combinations are rejected.
 
     Parameters
     ----------
@@ -40,8 +40,8 @@ class NodeParameters(Generic[P]):
     Raises
     ------
     UserError
-        A given parameter that is unknown, of the wrong type, out of bounds, or that is meant for
-        the node and does not take effect.
+        If a given parameter is unknown, of the wrong type, out of bounds, or meant for the node
+        but without effect.
     """
 
     def __init__(

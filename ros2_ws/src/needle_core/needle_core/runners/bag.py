@@ -1,7 +1,7 @@
-"""Runs a component on a bag: it receives the recorded messages at their send times.
+"""Runner of a component on a bag: delivers the recorded messages at their send times.
 
-Its services are not called and its ports stay silent, because bags contain neither. Its timers tick
-on the bag's clock.
+Services are not called and ports stay silent, because bags contain neither. Timers follow the bag's
+clock.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class BagRunner:
     def deliver(self, topic: str, message: Any, at: Moment) -> Iterator[Publish]:
         """Run the due timers, then handle a message; yield the publications.
 
-        A timer that missed several periods ticks once.
+        A timer that missed several periods fires once.
         """
         if not self._is_started:
             self._is_started = True

@@ -1,4 +1,4 @@
-"""Virtual runner at the pace of the wall clock, with events from pages and other processes."""
+"""Virtual runner at the pace of the wall clock, with input from web pages and other processes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from needle_core.runners.process import Process
 from needle_core.runners.virtual import VirtualRunner
 
 SLACK = 0.05
-"""Delay behind the wall clock that the runner catches up; a longer delay is lost [s]."""
+"""Longest delay behind the wall clock that the runner makes up for; longer ones are lost [s]."""
 
 
 class PacedRunner(VirtualRunner):
@@ -37,7 +37,7 @@ class PacedRunner(VirtualRunner):
     bell : threading.Event, optional
         Signals new input.
     clock : callable, optional
-        Returns the wall clock's steady time [s].
+        Returns the monotonic real time [s].
     more : dict
         Further arguments of `VirtualRunner`.
 
@@ -75,7 +75,7 @@ class PacedRunner(VirtualRunner):
 
     def run(self, seconds: float) -> bool:
         """Run until a component exits, or for `seconds`; return whether one exited."""
-        # The end is an event as well, so that the runner waits for it.
+        # Schedule the end as an event, so that the runner waits for it.
         self.timeline.call_after(seconds, lambda: None)
         return self.timeline.run(seconds, self._wait_for)
 

@@ -1,4 +1,4 @@
-"""A component as a process: its handlers run one after the other, each for its compute time."""
+"""Component as a simulated process whose handlers run in sequence and take compute time."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Handlers:
         self._failures = 0
 
     def run(self, work: Callable[[], Actions]) -> list[Action]:
-        """Return the actions of a handler, up to its failure if it fails."""
+        """Return the actions of a handler; if it fails, those before the failure and its report."""
         actions: list[Action] = []
         try:
             for action in work():
@@ -59,7 +59,7 @@ Work = Callable[[Moment], Actions]
 
 
 def uniform(shortest: float, longest: float) -> Compute:
-    """Return compute times that are uniform between two bounds, for all handlers [s]."""
+    """Return a function that draws compute times [s] uniformly between two bounds."""
     return lambda actions, rng: rng.uniform(shortest, longest)
 
 
@@ -80,15 +80,15 @@ class Process:
     Attributes
     ----------
     is_alive : bool
-        Whether it runs; an ended process does nothing any more.
+        Whether the process is running; a process that has ended handles no events.
     slowness : float
         Additional compute time of each handler [s].
     known : list of Process
-        Processes that it has discovered.
+        Processes that this one has discovered.
     routes : dict of str to list
-        Topic to its receivers among them, each with row and link; built on demand.
+        Topic to its discovered receivers, each with row and link; built on demand.
     batches : dict of str to list
-        Port to its waiting items.
+        Port to its queued items.
     latched : dict of str to object
         Topic to its last message, for late subscribers.
     health : dict of str to Diagnostic
@@ -122,13 +122,13 @@ class Process:
 
     @property
     def is_frozen(self) -> bool:
-        """Whether it is frozen."""
+        """Whether the process is frozen."""
         return self._timeline.now < self._frozen_until
 
     def enqueue(
         self, source: str, work: Work, *, depth: int | None = None, sent_ns: int = 0
     ) -> None:
-        """Queue an event; at most the newest `depth` events of one source wait."""
+        """Queue an event; of each source, only the newest `depth` events are kept."""
         if not self.is_alive:
             return
         now = self._timeline.now

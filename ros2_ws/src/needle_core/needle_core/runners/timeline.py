@@ -10,11 +10,11 @@ from collections.abc import Callable
 from needle_core.component import Moment
 
 START_NS = 1_000_000_000
-"""Stamp at the start of a run [ns]; in ROS, 0 means that no time is known."""
+"""Stamp at the start of a run [ns]; in ROS, 0 means an unknown time."""
 
 
 class Timeline:
-    """Events in the order of their time, then of their scheduling.
+    """Event queue, ordered by time and then by order of scheduling.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Timeline:
         return stream
 
     def draw(self, name: str, bounds: tuple[float, float]) -> float:
-        """Return a uniform number between two bounds from a stream."""
+        """Draw a uniform number between two bounds from a stream."""
         return self.stream(name).uniform(*bounds)
 
     def call_at(self, when: float, event: Callable[[], None]) -> None:
@@ -63,11 +63,11 @@ class Timeline:
 
     @property
     def stamp_ns(self) -> int:
-        """Present stamp [ns]."""
+        """Current stamp [ns]."""
         return START_NS + self.clock_offset_ns + round(self.now * 1e9)
 
     def interrupt(self) -> None:
-        """Make `run` return after the present event."""
+        """Make `run` return after the current event."""
         self._is_interrupted = True
 
     def run(self, seconds: float, wait_for: Callable[[float], bool] | None = None) -> bool:
@@ -79,7 +79,7 @@ class Timeline:
             Maximum duration [s].
         wait_for : callable, optional
             Called with the time of the next event [s]; may wait, and returns False if an earlier
-            event may have been added meanwhile.
+            event may have been added in the meantime.
         """
         end = self.now + seconds
         heap, self._is_interrupted = self._heap, False

@@ -11,7 +11,7 @@ from needle_core.runners.timeline import Timeline
 
 
 class Link(NamedTuple):
-    """Connection of two components: by a topic, a service or a port."""
+    """Connection between two components: a topic, a service or a port."""
 
     sender: str
     topic: str
@@ -38,11 +38,11 @@ class Arrival(NamedTuple):
 
 Arrivals = Sequence[Arrival]
 Fault = Callable[[Link, Any, float, random.Random], Arrivals | None]
-"""Maps (link, message, time [s], random stream) to the arrivals; None: the message unchanged."""
+"""Maps (link, message, time [s], random stream) to arrivals; None leaves the message unchanged."""
 
 
 class Transport:
-    """Delivers messages with latency, in order unless a fault lets one overtake.
+    """Delivers messages with latency, in order unless a fault reorders them.
 
     Parameters
     ----------

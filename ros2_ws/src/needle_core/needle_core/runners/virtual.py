@@ -1,9 +1,9 @@
-"""Runs components in one process on a virtual clock: the same seed gives bit-identical runs.
+"""Runner of components in one process on a virtual clock; equal seeds give bit-identical runs.
 
 An event heap holds deliveries, timers and answers. Each delivery has a latency and each handler a
 compute time, both random. Every link and every handler has its own random stream, so that adding a
-component changes no other draw. While a component computes, its inputs wait in queues of the depth
-given by their delivery.
+component changes no other draw. While a component computes, its inputs wait in queues with the
+depth of their QoS.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ COMPUTE = (0.1e-3, 0.3e-3)
 DISCOVERY = (0.02, 0.2)
 """Time until one component discovers another [s]."""
 LEASE = 8.0
-"""Time after which the others drop a killed component [s]."""
+"""Time after which the other components drop a killed one [s]."""
 _DIAGNOSTICS_PERIOD = 1.0
 
 Tap = Callable[[int, str, Any, Output], None]
@@ -67,7 +67,7 @@ class VirtualRunner:
     seed : int
         Seed of latencies and compute times.
     compute : mapping of str to Compute
-        Component to the compute times of its handlers; `COMPUTE` by default.
+        Compute times of the handlers by component; `COMPUTE` by default.
     faults : sequence of Fault
         Faults, applied to each delivery in order.
     taps : sequence of Tap
@@ -78,7 +78,7 @@ class VirtualRunner:
     timeline : Timeline
         Virtual time and random streams.
     exits : dict of str to Exit
-        Components that have exited.
+        Exit action of each component that has exited.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class VirtualRunner:
                 self._report_port(name, port)
 
     def kill(self, name: str) -> None:
-        """End a component at once, like SIGKILL: the others drop it after `LEASE`."""
+        """End a component at once, like SIGKILL; the others drop it after `LEASE`."""
         process = self._named(name)
         self._remove(process)
         self.timeline.call_after(LEASE, partial(self._forget, process))
@@ -282,7 +282,7 @@ class VirtualRunner:
     # ---- discovery ------------------------------------------------------------------------------
 
     def _discover(self, process: Process, other: Process) -> None:
-        """Connect one component to another: from now on its messages arrive there."""
+        """Connect one component to another, which receives its messages from now on."""
         if not (process.is_alive and other.is_alive):
             return
         process.known.append(other)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, get_type_hints
 from needle_core.errors import OutOfBoundsError, UserError
 
 ABOVE_0 = math.nextafter(0.0, 1.0)
-"""Smallest positive number, as an exclusive lower bound of 0."""
+"""Smallest positive number, used to exclude 0 itself from a range."""
 
 
 class Bounds(NamedTuple):
@@ -20,7 +20,7 @@ class Bounds(NamedTuple):
     lower, upper : float
         Inclusive bounds; an infinite value is rejected even if `upper` is infinite.
     unit : str
-        "-" for none.
+        Unit of the field, "-" for none.
     unlimited : bool
         Whether infinity is a valid value.
     """

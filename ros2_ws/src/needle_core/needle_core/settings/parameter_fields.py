@@ -1,4 +1,4 @@
-"""Node parameters as frozen dataclasses: one declaration with default, unit, range and text."""
+"""Node parameters as frozen dataclasses; a field declares default, unit, range and description."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class ParameterSpec:
     lower, upper : float
         Inclusive bounds of a number, or of each element of a list.
     choices : tuple of str
-        Allowed texts; empty: any text.
+        Allowed texts; if empty, any text is allowed.
     read_only : bool
-        Whether the value is fixed after the start.
+        Whether the value cannot change after the start.
     texts : bool
         Whether the elements of a list are texts; otherwise they are numbers.
     """
@@ -51,7 +51,7 @@ def parameter(default: Any, *spec: Any, **more: Any) -> Any:
 
 
 def fixed_parameter(default: Any, *spec: Any, **more: Any) -> Any:
-    """Declare a field whose value is fixed after the start; see `parameter`."""
+    """Declare a field whose value cannot change after the start; see `parameter`."""
     return parameter(default, *spec, **more, read_only=True)
 
 
@@ -67,10 +67,10 @@ def check_fields(parameters: Any) -> None:
     Raises
     ------
     OutOfBoundsError
-        A number that is outside its bounds.
+        If a number is outside its bounds.
     UserError
-        A number that is not finite, a text that is not one of the choices, or a type other than
-        that of the default.
+        If a number is not finite, a text is not one of the choices, or a type differs from that of
+        the default.
     """
     for name, spec, default in specs(parameters):
         value = getattr(parameters, name)
@@ -101,7 +101,7 @@ def from_values(kind: type[P], values: Mapping[str, Any], node: str) -> P:
     Raises
     ------
     UserError
-        An unknown parameter, or a value that the dataclass rejects.
+        If a parameter is unknown, or the dataclass rejects a value.
     """
     known = {name: default for name, _, default in specs(kind)}
     for name, value in values.items():

@@ -1,4 +1,4 @@
-"""Parameter files: matches their sections with the full names of nodes, like ROS."""
+"""Parameter files, whose sections are matched with the full names of nodes as in ROS."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def matching_sections(source: object, sections: Sections, node: str, kind: str) 
     ------
     UserError
         If sections for such a node exist but none matches this one, which would then run with its
-        defaults, or if the name of a section is similar to that of a node.
+        defaults, or if the name of a section is a misspelt node name.
     """
     own = (kind, _last(node))
     for name in sections:
@@ -85,7 +85,7 @@ def matching_sections(source: object, sections: Sections, node: str, kind: str) 
 
 
 def values_for(source: object, sections: Sections, node: str, kind: str) -> dict[str, Any] | None:
-    """Return the parameters that sections set in a node; None without a matching section.
+    """Return the parameters that sections set in a node; None if no section matches.
 
     Arguments and errors are those of `matching_sections`.
     """
@@ -106,7 +106,7 @@ def command_line_sections(words: Sequence[str]) -> list[tuple[str, Sections]]:
     Raises
     ------
     UserError
-        As `read_sections`.
+        For the same reasons as `read_sections`.
     """
     given: list[tuple[str, Sections]] = []
     ros = words[words.index("--ros-args") :] if "--ros-args" in words else []
@@ -137,11 +137,11 @@ def check_command_line(words: Sequence[str], node: str) -> list[str]:
     Raises
     ------
     UserError
-        As `read_sections` and `matching_sections`, and if a file overrides a `-p`.
+        For the reasons of `read_sections` and `matching_sections`, or if a file overrides a `-p`.
     """
     warnings = []
     overrides: dict[str, str] = {}
-    # Order of rcl: a section keeps the place of its first occurrence, and the last section wins.
+    # As in rcl, a section keeps the position of its first occurrence, and the last section wins.
     kept: dict[str, dict[str, str]] = {}
     for source, sections in command_line_sections(words):
         reached = matching_sections(source, sections, node, Path(words[0]).stem)
@@ -165,7 +165,7 @@ def check_command_line(words: Sequence[str], node: str) -> list[str]:
 
 
 def read_parameters(path: Path, nodes: Sequence[str], namespace: str = "") -> Parameters:
-    """Return the parameters that a ROS parameter file sets in nodes that are started together.
+    """Return the parameters that a ROS parameter file sets in nodes started together.
 
     Parameters
     ----------
@@ -184,7 +184,8 @@ def read_parameters(path: Path, nodes: Sequence[str], namespace: str = "") -> Pa
     Raises
     ------
     UserError
-        As `read_sections` and `matching_sections`, and for a section of another node.
+        For the reasons of `read_sections` and `matching_sections`, or if a section is for another
+        node.
     """
     sections = read_sections(path)
     if not sections:
@@ -231,13 +232,13 @@ def _unique(where: object, pairs: Iterable[tuple[str, T]]) -> dict[str, T]:
 
 
 def _matches(section: str, node: str) -> bool:
-    # Pattern of rcl: /* is one name, /** is any number of names.
+    # Wildcards of rcl: /* matches one name, /** any number of names.
     pattern = re.escape(absolute_name(section)).replace(r"/\*", r"(/\w+)").replace(r"\*", "*")
     return re.fullmatch(pattern, node) is not None
 
 
 def absolute_name(name: str) -> str:
-    """Return the name of a node or topic with a slash in front."""
+    """Return the name of a node or topic with a leading slash."""
     return name if name.startswith("/") else f"/{name}"
 
 
