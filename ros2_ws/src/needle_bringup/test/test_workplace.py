@@ -1,4 +1,4 @@
-"""What a command starts: how it ends is told in one line, and nothing of it is left."""
+"""Processes of a command: their end is reported in one line, and nothing of them is left."""
 
 from __future__ import annotations
 

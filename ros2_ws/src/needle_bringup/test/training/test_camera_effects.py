@@ -1,4 +1,4 @@
-"""Effects of cameras: an image stays where it is and as bright as told."""
+"""Camera effects: an image keeps its geometry and gets the requested brightness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planes in `rig`, and a target that drifts, breathes, jumps, or rests: where it is expected."""
+"""Planes in `rig`, and prediction of targets that drift, breathe, jump or rest."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def sine(rate: float) -> Path:
 
 
 def chest(rate: float) -> Path:
-    """Return a breath that rests when it is out, as a sleeper's does."""
+    """Return a breath that rests after exhalation, as a sleeper's does."""
     return lambda t: PLACE + DRIFT * t + 2.0 * BREATH * np.cos(np.pi * rate * t) ** 4
 
 
@@ -76,7 +76,7 @@ def test_planes_nothing_can_reach_are_refused() -> None:
     steep = plane_from_pose("rig", [0.0] * 3, [0.0, np.sin(0.6), 0.0, np.cos(0.6)])
     with pytest.raises(UserError, match="reaches no plane"):
         check_plane(steep, 1 / 0.122, 0.12)
-    # Of a part of an insertion nothing is said.
+    # A smaller depth is checked as SHORTEST_CHECKED_DEPTH.
     for offset, depth in ((0.02, 0.12), (0.02, 0.01), (0.05, 0.19)):
         check_plane(offset_plane(offset), 1 / 0.122, depth)
 
@@ -110,7 +110,7 @@ def test_a_motion_is_foretold_whatever_its_shape_and_clock() -> None:
 def test_a_fast_drift_is_foretold_after_three_seconds() -> None:
     path: Path = lambda t: PLACE + 30.0 * DRIFT * t  # noqa: E731
     np.testing.assert_allclose(seen(path, 3.0).at(50.0), path(50.0), atol=1e-3)
-    # A breath that looks like a drift for so long is not followed far away.
+    # A breath that resembles a drift for so long is not followed far away.
     for rate in (0.1, 0.15, 0.2, 0.33):
         away = seen(sine(rate), 3.0).at(50.0) - PLACE
         assert np.linalg.norm(away) < 0.015
@@ -147,7 +147,7 @@ def test_a_fast_topic_takes_no_more_memory_than_a_slow_one() -> None:
 
 
 def test_nothing_is_foretold_far_from_where_it_was_seen() -> None:
-    """Samples at odd times can leave a period nearly free: what it says of later is then noise."""
+    """Samples at odd times can leave a period nearly undetermined: its prediction is then noise."""
     rng = np.random.default_rng(6)
     for _ in range(60):
         times = np.sort(rng.uniform(0.0, 8.0, rng.integers(7, 12)))

@@ -22,19 +22,19 @@ from needle_core.process.shutdown import ENDING_SIGNALS, ShutdownFlag, interrupt
 
 
 class LeftError(BaseException):
-    """Stands for the end of the process by `os._exit`."""
+    """Stand-in for the end of the process by `os._exit`."""
 
 
 @pytest.fixture(autouse=True)
 def _handlers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let no process end, and leave every signal as it was."""
+    """Keep the process alive, and restore all signal handlers."""
 
     def leave(code: int) -> NoReturn:
         raise LeftError(code)
 
     monkeypatch.setattr(os, "_exit", leave)
     before = {number: signal.getsignal(number) for number in ENDING_SIGNALS}
-    # A shell's background, where tests may run, ignores SIGINT, and nohup SIGHUP.
+    # Background jobs of a shell, in which tests may run, ignore SIGINT; nohup ignores SIGHUP.
     for number in ENDING_SIGNALS:
         signal.signal(number, signal.default_int_handler)
     yield

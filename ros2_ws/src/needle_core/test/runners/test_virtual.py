@@ -35,7 +35,7 @@ from scenario.transport_faults import delay, drop, duplicate, silence
 from .runner_scene import Once, Receiver, Sender, Server, Wired, run
 
 NUMBER = 0
-"""Of a request: the scene's server knows it."""
+"""Number of a request, by which the server of the scene identifies it."""
 
 
 def texts(told: Sequence[tuple[int, str, Any]]) -> list[str]:

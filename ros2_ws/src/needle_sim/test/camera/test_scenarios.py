@@ -49,7 +49,7 @@ def place_at(height: float, pixel: np.ndarray, camera: SimulatedCamera) -> np.nd
 
 @pytest.fixture(scope="module", params=SCENARIOS)
 def renderers(rig: StereoRig, request: pytest.FixtureRequest) -> list[StereoRenderer]:
-    """Return a scenario's of seeds 5, 5 and 6."""
+    """Return the renderers of a scenario with seeds 5, 5 and 6."""
     scenario = SCENARIOS[request.param]
     return [StereoRenderer(small(rig), seed, scenario=scenario) for seed in (5, 5, 6)]
 

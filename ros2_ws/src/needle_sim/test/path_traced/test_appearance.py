@@ -1,4 +1,4 @@
-"""Appearances: drawn by the seed, fixed by name, and their light on the sensor."""
+"""Appearances: drawn by the seed or fixed by name, and their light on the sensor."""
 
 from __future__ import annotations
 

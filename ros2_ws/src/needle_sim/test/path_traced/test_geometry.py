@@ -32,7 +32,7 @@ TOP_AND_SIDE = load_stereo_rig(CALIBRATION.with_name("calibration_top_and_side.y
 
 @pytest.fixture(scope="module")
 def boxes(tmp_path_factory: pytest.TempPathFactory) -> list[StereoRig]:
-    """Return boxes drawn at random, seen by webcams."""
+    """Return random boxes in front of webcams."""
     path = tmp_path_factory.mktemp("boxes") / "box.yaml"
     rigs = []
     for seed in range(8):
@@ -47,7 +47,7 @@ def cameras(rigs: list[StereoRig]) -> Iterator[tuple[StereoRig, SimulatedCamera]
 
 
 def bent_line() -> tuple[np.ndarray, np.ndarray]:
-    """Return a middle line of curvature 8 / m in a slanting plane, and the side it bends to."""
+    """Return a centre line of curvature 8 / m in an oblique plane, and the side it bends to."""
     aside = np.array([0.6, 0.8, 0.0])
     angle = np.linspace(0.0, 0.4, 201)[:, np.newaxis]
     line = 0.125 * (np.sin(angle) * [0.0, 0.0, 1.0] + (1.0 - np.cos(angle)) * aside)
@@ -75,9 +75,9 @@ def test_a_box_is_seen_through_walls_that_end(boxes: list[StereoRig]) -> None:
         rays = refracted_rays(np.stack([column, row], axis=-1), camera, rig)
         inside = rays.origin[~rays.in_air]
         assert inside[:, 2].min() > 0.0
-        # Walls are a little out of square.
+        # The walls are slightly out of square.
         assert np.abs(inside @ other.window.normal).max() < other.window.inner + 1e-3
-        # Beside its walls a line of sight goes straight on from the camera.
+        # A line of sight beside the walls continues straight from the camera.
         beside = rays.origin[rays.in_air] - camera.centre
         away = np.cross(beside, rays.direction[rays.in_air])
         assert np.abs(away).max(initial=0.0) < 1e-12
@@ -101,7 +101,7 @@ def test_the_mesh_has_its_diameter_and_its_end(hollow: bool) -> None:
     needle = needle_mesh(line, aside, look)
     heading = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
     assert look.bevel_length == pytest.approx(0.0012124, abs=1e-7)
-    # Beside the axis's end, on the side it bends to, and level with it.
+    # Beside the end of the axis, on the side of the bend, and level with it.
     away = needle.extreme - line[-1]
     assert np.linalg.norm(away) == pytest.approx(0.00035, abs=1e-8)
     assert abs(away @ heading) < 1e-6

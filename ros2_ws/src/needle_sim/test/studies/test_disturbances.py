@@ -32,12 +32,12 @@ def error(disturbances: Disturbances, exposure: int = 1, seed: int = 1) -> Float
 
 
 def fits(sample: FloatArray, spread: Any) -> bool:
-    """Tell whether numbers have a distribution: of these p is uniform, 1e-4 is one in 10,000."""
+    """Return whether numbers have a distribution: then p is uniform, and < 1e-4 once in 10,000."""
     return bool(stats.kstest(sample.ravel(), spread.cdf, method="asymp").pvalue > 1e-4)
 
 
 def check_isotropic(off: FloatArray) -> None:
-    """Check that vectors go in any direction: on the sphere each coordinate is uniform."""
+    """Check that vectors have any direction: each coordinate on the sphere is uniform."""
     unit = off / np.linalg.norm(off, axis=1)[:, np.newaxis]
     for coordinate in unit.T:
         assert fits(coordinate, stats.uniform(-1.0, 2.0))
@@ -58,7 +58,7 @@ def test_noise_has_its_distribution_and_is_independent(shape: str, spread: Any) 
     assert fits(off, spread)
     others = (error(noise, exposure=2), error(noise, seed=2))
     columns = np.column_stack([off, *others])
-    # By rank: Student's t has no fourth moment.
+    # By rank, because Student's t has no fourth moment.
     assert np.all(np.abs(stats.spearmanr(columns).statistic - np.eye(9)) < FIVE)
     np.testing.assert_array_equal(error(Disturbances(noise_shape=shape)), 0.0)
 
@@ -94,7 +94,7 @@ def test_dropped_tips_are_missing_whole_and_the_others_untouched() -> None:
     assert np.all(missing.all(axis=1) == missing.any(axis=1))
     assert abs(np.mean(missing[:, 0]) - 0.2) < FIVE * np.sqrt(0.2 * 0.8)
     np.testing.assert_array_equal(seen[~missing], kept[~missing])
-    # The first tip is there, and no outlier.
+    # The first tip is never missing, and never an outlier.
     all_wrong = Disturbances(noise=0.001, outliers=1.0, found=0.0)
     assert np.all(np.abs(error(all_wrong, exposure=0)) <= 0.001 + 1e-12)
 
@@ -128,10 +128,10 @@ def test_a_bias_walks_by_tenths_within_its_bounds_and_stays_spread_evenly() -> N
     steps = np.diff(bias, axis=0)
     inside = np.abs(bias[:-1]) < 0.0009
     np.testing.assert_allclose(np.abs(steps[inside]), 0.0001, atol=1e-12)
-    # Up as often as down, whatever the step before.
+    # Up and down equally often, whatever the previous step.
     assert abs(np.mean(steps > 0.0) - 0.5) < 0.01
     assert abs(np.corrcoef(steps[0].ravel(), steps[1].ravel())[0, 1]) < FIVE + 0.1
-    # Each needle's own, wherever a part begins.
+    # Each needle has its own, wherever a part begins.
     np.testing.assert_array_equal(BiasWalk(0.001, 1, 41, 5).at(1), bias[1, 41:46])
 
 

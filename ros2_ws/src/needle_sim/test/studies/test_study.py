@@ -180,7 +180,7 @@ def test_the_roll_wanders_by_the_root_of_the_insertion_and_a_bias_is_seen_alone(
         off = seen - needles.true.tips
         np.testing.assert_allclose(off, bias.at(step + 1), atol=1e-15)
     turned = np.arctan2(needles.true.T_rig_tip[:, 1, 0], needles.true.T_rig_tip[:, 0, 0])
-    # 1 rad/sqrt(m) over 20 mm of stage, of which 16 mm are cut; five standard errors.
+    # 1 rad/sqrt(m) over 20 mm of the stage, of which 16 mm cut tissue; five standard errors.
     wanted = np.sqrt(0.016)
     assert abs(np.std(turned) / wanted - 1.0) < 5.0 / np.sqrt(2.0 * count)
     assert abs(np.mean(turned)) < 5.0 * wanted / np.sqrt(count)

@@ -1,4 +1,4 @@
-"""Runs through the renderer's scenarios, a sample of what `scripts/verify C` does at full size."""
+"""Runs through the renderer's scenarios, a sample of the full-size checks of `scripts/verify C`."""
 
 from __future__ import annotations
 

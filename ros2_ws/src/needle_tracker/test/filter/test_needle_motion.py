@@ -85,7 +85,7 @@ def test_sequential_corrections_equal_one_batch(motion: NeedleMotion) -> None:
 def test_an_error_of_the_stage_is_estimated_and_does_not_move_the_tip(
     motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
-    """Zero 1 mm off, scale 1 %: 60 mm of insertion, a sighting and a length for each mm."""
+    """Zero wrong by 1 mm, scale by 1 %: 60 mm of insertion, a sighting and a length per mm."""
     rng, zero, scale = np.random.default_rng(2), 1e-3, 0.01
     at = motion.mean[POSITION]
     for mm in range(60):

@@ -42,7 +42,7 @@ def after(
 def test_an_end_at_the_insertion_is_the_needle_at_once(settings: StereoTrackerParameters) -> None:
     assert after(settings, [0.05], [0.05]).log_odds() > ACCEPTED
     assert after(settings, [0.05], [0.056]).log_odds() < 0.0
-    # A stage 1 mm off does not hide the needle.
+    # A stage error of 1 mm does not hide the needle.
     assert after(settings, [0.05], [0.051]).log_odds() > ACCEPTED
 
 

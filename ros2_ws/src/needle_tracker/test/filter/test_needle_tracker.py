@@ -71,7 +71,7 @@ def test_a_rendered_needle_is_measured_to_some_tenths_of_a_millimetre(
     ]
     errors = tip_errors(measured, [pose for _, pose, _, _ in exposures])
     if not insertion_known:
-        # It must move before it is believed.
+        # It must move before it is accepted.
         assert np.all(np.isnan(errors[0]))
         errors, measured, exposures = errors[2:], measured[2:], exposures[2:]
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.2e-3
@@ -79,7 +79,7 @@ def test_a_rendered_needle_is_measured_to_some_tenths_of_a_millimetre(
     for m, error, (_, pose, _, _) in zip(measured, errors, exposures, strict=True):
         assert m.tip is not None
         assert error @ np.linalg.solve(m.tip.covariance, error) < 20.0
-        # The visible end leans by the pre-bend, not more.
+        # The visible end leans by no more than the pre-bend.
         assert m.tip.direction @ pose[:3, 2] > math.cos(math.radians(8.0))
 
 
@@ -101,13 +101,13 @@ def test_the_needle_is_seen_from_just_beyond_the_entry(
 def test_an_unseen_short_needle_follows_from_the_insertion(
     tracker: NeedleTracker, draw_pair: Drawer
 ) -> None:
-    """A loop must go on: whether the needle is seen shows a few mm later."""
+    """A control loop must continue: only some mm deeper the needle can be detected or missed."""
     for insertion in (0.001, 0.005, 0.0079):
         measured = tracker.process(*draw_pair(None, noise=5.0), insertion)
         assert (measured.state, measured.reason) == (TrackState.ENTRY, "")
         assert measured.tip is not None
         assert measured.tip.position.tolist() == [0.0, 0.0, insertion]
-        # As far aside as the entry angle says.
+        # The lateral sigma follows from the entry angle.
         assert measured.tip.covariance[0, 0] > (insertion * math.sin(math.radians(10.0))) ** 2
     assert tracker.process(*draw_pair(None, noise=5.0), 0.0081).tip is None
 
@@ -128,7 +128,7 @@ def test_same_images_give_the_same_bits(
 def test_no_function_is_compiled_after_the_warm_up(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: Callable[..., np.ndarray]
 ) -> None:
-    """A first needle of another length must not make a pair wait for seconds."""
+    """The length of the first needle must not cause a compilation, which takes seconds."""
 
     def compiled_for() -> dict[str, int]:
         return {
@@ -154,7 +154,7 @@ def test_no_function_is_compiled_after_the_warm_up(
 
 
 def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Drawer) -> None:
-    """Sheath, hole, uneven light and noise are there; the needle is not."""
+    """Sheath, hole, uneven light and noise are drawn, but no needle."""
     for seed, insertion in enumerate((0.009, 0.02, 0.08, 0.12, None, None, None, None)):
         measured = tracker.process(*draw_pair(None, seed=seed, noise=5.0), insertion)
         assert measured.tip is None

@@ -22,7 +22,7 @@ _CHI_SQUARED_999 = 16.27  # of three degrees of freedom
 
 
 def cut(camera: Camera, crop: list[int]) -> Camera:
-    """Return the camera that sees only a part of the image."""
+    """Return a camera cropped to a part of the image."""
     column, row, width, height = crop
     matrix = camera.camera_matrix.copy()
     matrix[:2, 2] -= column, row
@@ -45,7 +45,7 @@ def tracked(
     empty: bool,
     insertion: bool = True,
 ) -> list[tuple[SpatialTip | None, np.ndarray]]:
-    """Return what is said of each pair of a scene, and the truth; a box has its own cameras."""
+    """Return the result for each pair of a scene, and the truth; a box has its own cameras."""
     folder = SCENES / name
     scene: dict[str, Any] = yaml.safe_load((folder / "scene.yaml").read_text(encoding="utf-8"))
     if (folder / "calibration.yaml").is_file():
