@@ -1,4 +1,4 @@
-"""The tracer itself, where it is installed: an extra, which `scripts/test` does not bring along."""
+"""The path tracer, if it is installed: an extra that `scripts/test` does not install."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ POINTS = np.array([[0.0, 0.0, 0.03], [0.012, 0.03, 0.09], [-0.014, -0.035, 0.12]
 
 
 class BareScene(NamedTuple):
-    """What `PathTracer` needs of a scene."""
+    """Scene data that `PathTracer` needs."""
 
     tracer: Any
     floors: list[Any]
@@ -45,7 +45,7 @@ def mitsuba() -> Mitsuba:
 
 
 def quarter_size(rig: StereoRig) -> StereoRig:
-    """Return the rig with images of a quarter of the sides."""
+    """Return the rig with images of a quarter of the width and height."""
 
     def smaller(camera: SimulatedCamera) -> SimulatedCamera:
         matrix = camera.camera_matrix.copy()

@@ -1,4 +1,4 @@
-"""The small `ros2` in a running graph: what it prints, what it sends, how it ends."""
+"""The small `ros2` in a running graph: output, sent messages, exit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LIMIT = 60.0
 
 
 class Partner(Node):
-    """A node to look at and to speak to."""
+    """Node that the tested commands list, call and listen to."""
 
     def __init__(self, context: Context) -> None:
         super().__init__("partner", namespace="rig", context=context)
@@ -103,13 +103,13 @@ class Ros2:
 
 
 def at_once(ros2: type[Ros2], *commands: str) -> list[Ros2]:
-    """Run commands side by side: each waits for seconds."""
+    """Run commands in parallel, because each takes seconds."""
     with ThreadPoolExecutor() as pool:
         return list(pool.map(lambda command: ros2(*shlex.split(command)), commands))
 
 
 def test_lists_nodes_and_topics(ros2: type[Ros2]) -> None:
-    # Another command's node is in the graph, too, but hidden.
+    # The node of another command is also in the graph, but hidden.
     nodes, topics = at_once(ros2, "node list", "topic list")
     assert nodes.out == "/rig/partner\n"
     assert "/rig/hold" in topics.out.splitlines()

@@ -1,4 +1,4 @@
-"""Today's controller on the frozen bags' inputs: what it sends is what was recorded."""
+"""Today's controller on the inputs of the frozen bags: its output is the recorded one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""scripts/env.sh, sourced in a checkout of its own whose path has a space."""
+"""scripts/env.sh, sourced in a separate checkout whose path has a space."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def sourced(name: str, root: Path, times: int = 1, **variables: str) -> dict[str
 def test_sets_the_environment_under_strict_options_from_any_folder(name: str, set_up: Path) -> None:
     before = {"LD_LIBRARY_PATH": "/elsewhere", "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
     env = sourced(name, set_up, 1, **before)
-    # Sourced twice it is the same.
+    # A second call changes nothing.
     assert {**sourced(name, set_up, times=2, **before), "_": ""} == {**env, "_": ""}
     assert env["PATH"].split(":")[0] == str(set_up / ".venv/bin")
     assert env["AMENT_PREFIX_PATH"] == str(set_up / ".venv")

@@ -1,4 +1,4 @@
-"""The examples in docs/examples do what they say: of those that documents do not type."""
+"""Examples in docs/examples that the tests of the pages do not execute."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ NOISE, STEP = SETTINGS.tip_noise_bound, SETTINGS.step_length
 
 @pytest.fixture
 def own(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return what gives the class of a module of the example package."""
+    """Return a function that gives the class of a module of the example package."""
     monkeypatch.syspath_prepend(EXAMPLES / "own_controllers")
 
     def of(module: str, name: str) -> Any:
@@ -123,7 +123,7 @@ def test_every_parameter_file_is_tried() -> None:
 def test_a_notebook_runs(notebook: Path) -> None:
     for name in ("pandas", "nbclient", "ipykernel"):
         pytest.importorskip(name, reason="the notebooks' lock is not installed: docs/viewers.md")
-    # In a process: what runs it leaves an event loop behind.
+    # In a separate process: running it leaves an event loop behind.
     run = "import sys; from nbclient.cli import main; sys.exit(main())"
     done = subprocess.run(
         [sys.executable, "-c", run, "--timeout=60", str(notebook)],

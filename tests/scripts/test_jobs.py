@@ -1,4 +1,4 @@
-"""A signal that ends a script ends what it runs, whatever that is doing."""
+"""A signal that ends a script also ends its child processes, whatever they are doing."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ def test_a_signal_ends_script_and_child(number: signal.Signals) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        # what runs the tests may ignore signals in its background
+        # tests may run in a background that ignores signals
         preexec_fn=lambda: [signal.signal(n, signal.SIG_DFL) for n in (1, 2)],  # noqa: PLW1509
     ) as script:
         assert script.stdout is not None

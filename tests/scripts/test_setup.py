@@ -1,4 +1,4 @@
-"""scripts/setup: what it does, what it leaves undone when it can, and what it says.
+"""scripts/setup: its actions, the steps that it skips, and its messages.
 
 It runs for real, with stubs for Python and uv on the PATH: no test downloads anything.
 """
@@ -17,7 +17,7 @@ TOOLS = (
     *("bash", "basename", "cat", "chmod", "cut", "dirname", "env", "flock", "grep", "ls", "mkdir"),
     *("readlink", "rm", "sha256sum", "sort", "touch", "uname", "xargs"),
 )
-# Notes what it is asked for; its virtual environments hold it again, as Python and as uv.
+# Records its arguments; its virtual environments contain it again, as Python and as uv.
 STUB = """\
 case "$*" in
 *ensurepip*) echo "${PREFIX-/usr}" ;;
@@ -61,7 +61,7 @@ class Checkout:
         path.chmod(0o755)
 
     def set_up(self, *arguments: str, code: int = 0, **variables: str) -> list[str]:
-        """Run scripts/setup; return what was asked of Python and uv, then what it printed."""
+        """Run scripts/setup; return the calls of Python and uv, then the output."""
         self.notes.write_text("")
         env = {"PATH": str(self.tools), "HOME": "/nonexistent", "NOTES": str(self.notes)}
         command = [str(self.root / "scripts" / "setup"), *arguments]

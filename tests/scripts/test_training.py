@@ -1,4 +1,4 @@
-"""The training of the needle net: what it is shown, what it learns, and that it can be resumed."""
+"""Training of the needle net: its input, its progress, and its resumption."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_flat_image_is_level_and_an_edge_is_not() -> None:
-    # Running sums of such an image end a trifle below zero.
+    # Running sums of such an image end slightly below zero.
     for level in range(0, 256, 5):
         assert np.abs(normalized(np.full((120, 90), level, np.uint8))).max() < 0.01
     image = np.full((100, 100), 50, np.uint8)
@@ -154,7 +154,7 @@ def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
     paths = tmp_path / "needle_net.onnx", tmp_path / "checkpoint.pt"
     run = loop.new_run(3)
     with warnings.catch_warnings():
-        # The exporter says that another one is newer.
+        # The exporter warns of a newer version.
         warnings.simplefilter("ignore")
         loop.train(run, pool, loop.Plan(4, 5.0, *paths))
     other = loop.resumed(paths[1])
@@ -162,14 +162,14 @@ def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
     assert other.rng.bit_generator.state == run.rng.bit_generator.state
     for one, same in zip(run.net.parameters(), other.net.parameters(), strict=True):
         assert torch.equal(one, same)
-    # It goes on with samples of its own accord, and not beyond its end.
+    # It continues with its own samples, and not beyond its end.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         loop.train(other, Pool(folder), loop.Plan(6, 5.0, tmp_path / "other.onnx", paths[1]))
         loop.train(other, Pool(folder), loop.Plan(6, 5.0, tmp_path / "other.onnx", paths[1]))
     assert run.step == 4
     assert other.step == 6
-    # Any multiples of 4: the stored net is of no size.
+    # Any multiples of 4: the stored net has no fixed size.
     seen = np.random.default_rng(0).normal(0.0, 1.0, (1, 2, 100, 148)).astype(np.float32)
     with torch.no_grad():
         net = pytest.importorskip("training_net")

@@ -130,9 +130,9 @@ def test_a_second_finger_or_button_or_key_ends_a_hold(scene: Scene) -> None:
 def test_a_button_or_page_that_goes_ends_its_hold(scene: Scene) -> None:
     anew = "for (const old of document.querySelectorAll('button')) old.outerHTML = old.outerHTML"
     scene.ends(scene.hold_pointer, lambda: scene.tab.run(anew))
-    # What takes its place is a button like it.
+    # Its replacement is an identical button.
     scene.ends(scene.hold_pointer, lambda: scene.tab.release_pointer(*BUTTON))
-    # A page that is hidden, and one that is closed.
+    # A hidden page, and a closed one.
     browser, url = scene.browser, scene.tab.run("location.href")
     scene.ends(scene.hold_pointer, lambda: browser.open("about:blank"))
     browser.close_all_but(scene.tab)
@@ -169,7 +169,7 @@ def test_the_page_says_why_a_hold_ended_by_itself(scene: Scene) -> None:
     stalled = "hold ended: no echo from this page for 0.25 s (browser, network or console stalled)"
     scene.until(lambda: why() == stalled, "it says why")
     assert tab.run(_STATE) == "again"
-    # It goes with the next press.
+    # It disappears with the next press.
     scene.hold_pointer()
     assert why() == ""
     tab.release_pointer(*BUTTON)

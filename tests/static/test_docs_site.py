@@ -1,4 +1,4 @@
-"""The documents' site: no warning (of a dead link, too), nothing loaded from the network."""
+"""The documentation site: no warnings (such as dead links), nothing loaded from the network."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from code_lines import ROOT
 from docs_site.navigation import listed, navigation, parts
 
-# A link, script or image that a page loads by itself from another host.
+# A link, script or image that a page loads from another host.
 ELSEWHERE = re.compile(r'<(?:link|script|img)\b[^>]*\b(?:href|src)="((?:https?:)?//[^"]*)"')
 
 

@@ -1,4 +1,4 @@
-"""The console's page in a real browser, on a simulated rig: seen, steered, stopped."""
+"""The console's page in a real browser, on a simulated rig: display, steering, stop."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def address() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """Return a browser of its own."""
+    """Return a separate browser."""
     with sync_playwright() as playwright:
         context = playwright.chromium.launch_persistent_context(
             str(tmp_path_factory.mktemp("profile")),

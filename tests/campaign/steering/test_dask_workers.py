@@ -1,4 +1,4 @@
-"""Studies on a real scheduler and real workers, each a process: the same bits, whoever dies."""
+"""Studies on a real scheduler and real worker processes: the same bits, even if workers die."""
 
 from __future__ import annotations
 

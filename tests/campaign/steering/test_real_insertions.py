@@ -17,7 +17,7 @@ def write(path: Path, depth: float) -> Path:
     x, z = -0.025 + y**2 / (2.0 * RADIUS), 0.020 + 0.0 * y
     lines = ["Robot x,Tip x, Tip y, Tip z,Tip sec,Tip nanosec", "0,0,0,0,0,0"]
     for n, (a, b, c) in enumerate(1e3 * np.stack([x, y, z], axis=-1)):
-        # The same tip is written down twice.
+        # The same tip is recorded twice.
         lines += [f"0,{a},{b},{c},5,{n}"] * 2
     path.write_text("\n".join(lines), encoding="utf-8")
     return path

@@ -1,4 +1,4 @@
-"""A short training on a recording of one's own: about two minutes."""
+"""A short training on a user's own recording: about two minutes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def trained(tmp_path: Path, *words: str) -> str:
-    """Run the training; return what it says."""
+    """Run the training; return its output."""
     folders = ["--folder", str(tmp_path / "run"), "--output", str(tmp_path / "net.onnx")]
     done = subprocess.run(
         [sys.executable, str(TRAINING / "train_needle_map.py"), *words, *folders],

@@ -1,4 +1,4 @@
-"""The script of commission on emulated drives, with a person who does what it asks for."""
+"""The script of commission on emulated drives, with a person who follows its instructions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EVENTS = {BY_HAND[fault.name]: fault.event for fault in FAULTS if fault.name in 
 
 
 class Person:
-    """Answers, and does by hand what the script asks for, one second later."""
+    """Person who answers, and follows each instruction one second later."""
 
     def __init__(self, rig: ConformanceRig, scale: float = 1.0) -> None:
         self.rig, self.scale = rig, scale

@@ -1,4 +1,4 @@
-"""Driver and emulated drives: homing, set-up and cycles in which nothing goes wrong."""
+"""Driver and emulated drives: homing, set-up and cycles without faults."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SYNC, DEVICE_TYPE, LIMITS, HOMING_SPEEDS = 0x080, 0x1000, 0x607D, 0x6099
 
 
 class Bus:
-    """Every frame of the bus; loses those of an identifier for 0.3 s, when told until when."""
+    """Records every frame; loses those of one identifier for 0.3 s before `until`."""
 
     def __init__(self, loses: int = 0) -> None:
         self.frames: list[tuple[float, str, CanFrame]] = []
@@ -35,7 +35,7 @@ class Bus:
         return (Arrival(0.0, message),)
 
     def orders(self, *cob_ids: int, since: float = 0.0) -> list[tuple[float, CanFrame]]:
-        """Return what the driver sent under these COB-IDs."""
+        """Return the frames that the driver sent under these COB-IDs."""
         return [
             (time, frame)
             for time, sender, frame in self.frames
@@ -44,7 +44,7 @@ class Bus:
 
 
 def index_of(frame: CanFrame) -> int:
-    """Return the index of the object that an SDO frame is about."""
+    """Return the object index of an SDO frame."""
     return int.from_bytes(frame.data[1:3], "little")
 
 
@@ -67,7 +67,7 @@ def test_a_step_goes_in_even_cycles_to_where_it_should() -> None:
 
 
 def home(rig: VirtualRig) -> float:
-    """Home it; return how long that took from the answer on [s]."""
+    """Home the rig; return the duration from the answer on [s]."""
     rig.until(lambda: rig.hand.status.state == "DISABLED", "the driver")
     rig.call("device/confirm_needle_out", True)
     rig.call("device/home")
@@ -78,7 +78,7 @@ def home(rig: VirtualRig) -> float:
 
 def test_drives_that_take_speeds_in_rpm_and_say_so_home_at_the_speed_that_they_are_told() -> None:
     rig = VirtualRig(1, drives={"rpm": True, "insertion_start": 0.002})
-    # 2 mm at 2 mm/s and the way off the switch.
+    # 2 mm at 2 mm/s, and the distance off the switch.
     assert 1.0 < home(rig) < 1.6
     assert rig.place[0] == pytest.approx(0.0, abs=2e-5)
 
@@ -118,7 +118,7 @@ def test_both_drives_are_asked_side_by_side_and_homing_begins_when_both_have_tak
     assert asked[0x601][0] < asked[0x602][-1]
     assert asked[0x602][0] < asked[0x601][-1]
     rig.call("device/confirm_needle_out", True)
-    # The rotation drive's answers are lost for a while: it is asked again.
+    # The rotation drive's answers are lost for a while, so the request is repeated.
     begin, bus.until = rig.runner.now, rig.runner.now + 0.3
     rig.call("device/home")
     replied = rig.runner.now

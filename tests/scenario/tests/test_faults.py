@@ -1,4 +1,4 @@
-"""Schedules: drawn from the vocabulary alone, read as they were written, shrunk to what matters."""
+"""Schedules: drawn from the vocabulary, read as written, shrunk to the relevant faults."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def violated(result: RunResult) -> set[str]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for a person who gets nowhere no longer than it takes to see that."""
+    """Shorten the time limits of a run without progress."""
     monkeypatch.setattr(rig_run, "_GO_ON", 15.0)
     monkeypatch.setattr(rig_run, "_DRAW_OUT", 15.0)
 

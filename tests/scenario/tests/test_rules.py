@@ -1,4 +1,4 @@
-"""Every safety rule: a scene in which it counts, and a bug that takes it away."""
+"""Every safety rule: a scene that it protects, and a bug that disables it."""
 
 from __future__ import annotations
 

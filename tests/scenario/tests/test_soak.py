@@ -1,4 +1,4 @@
-"""The command: what it says of a night that somebody ends."""
+"""The soak command: its report after an interruption."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def ended(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     monkeypatch.setattr(soak, "results_here", results)
     monkeypatch.setattr(soak, "shrink", shrinking)
-    # A shell's background ignores SIGINT.
+    # Background jobs of a shell ignore SIGINT.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

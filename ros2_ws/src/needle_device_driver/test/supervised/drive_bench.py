@@ -169,7 +169,7 @@ class DriveBench(SupervisorBench):
         self.go()
 
     def obeys_late(self, drive: ScriptedDrive, seconds: float) -> None:
-        """Delay every command of a drive, then switch it off after some time [s]."""
+        """Delay the reaction of a drive to a command by some time [s]; then it is off."""
         due = math.inf
 
         def command(word: int) -> None:

@@ -22,7 +22,7 @@ def test_a_shaft_mirrors_where_its_normal_halves_the_angle_and_is_dark_where_it_
     camera, lamp = np.array([0.5, 0.0, 0.05]), np.array([0.4, 0.25, 0.05])
     line = np.linspace(0.0, 0.1, 200)[:, np.newaxis] * [0.0, 0.0, 1.0]
     share, place = lamp_reflection(line, camera, lamp, MetalShaft())
-    # Where both bisect the angle, and nowhere else as much.
+    # Level with camera and lamp, and nowhere else as much.
     middle = int(np.argmax(share))
     assert line[middle, 2] == pytest.approx(0.05, abs=2e-3)
     assert share.max() == pytest.approx(1.0, abs=1e-3)

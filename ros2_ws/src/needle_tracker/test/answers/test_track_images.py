@@ -25,7 +25,7 @@ SIGMA = 1e-4
 
 
 class Scripted:
-    """Stand-in for the tracker: brightness of an image is the tip's depth [mm]; 3 mm is the entry."""
+    """Stand-in for the tracker: an image's brightness is the tip's depth [mm]; entry at 3 mm."""
 
     made: list[StereoTrackerParameters]
     references: list[Any]
