@@ -91,7 +91,7 @@ def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
     return change
 
 
-def test_the_session_of_a_box_is_one() -> None:
+def test_the_box_session_is_valid() -> None:
     """Its board is visible from above and from the side; no synthetic rig draws it for the page."""
     page = blocks((ROOT / "docs/calibration.md").read_text("utf-8"))
     (text,) = (block.text for block in page if block.name == "box_session.yaml")

@@ -65,7 +65,7 @@ class Scene:
         self.port.close()
 
 
-def test_pyigtls_client_hears_the_needle_in_mm() -> None:
+def test_pyigtls_client_receives_the_needle_in_mm() -> None:
     pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
     with contextlib.closing(Scene(pyigtl.OpenIGTLinkClient)) as scene:
         assert scene.hears("NeedleStatus").string == "no needle data received"

@@ -115,7 +115,7 @@ def test_lists_nodes_and_topics(ros2: type[Ros2]) -> None:
     assert "/rig/hold" in topics.out.splitlines()
 
 
-def test_echo_hears_what_was_said_before_it_came_and_shortens_arrays(ros2: type[Ros2]) -> None:
+def test_echo_receives_earlier_messages_and_shortens_arrays(ros2: type[Ros2]) -> None:
     expected = "stamp:\n  sec: 0\n  nanosec: 0\nframe_id: above\n---\n"
     assert ros2("topic", "echo", "--once", "/rig/status").out == expected
     assert ros2("topic", "echo", "--once", "/rig/status", "--field", "frame_id").out == (
@@ -131,7 +131,7 @@ def test_echo_hears_what_was_said_before_it_came_and_shortens_arrays(ros2: type[
     assert "- '...'\n" in axes
 
 
-def test_pub_sends_so_many_messages_with_stamps_that_increase(
+def test_pub_sends_the_requested_messages_with_increasing_stamps(
     ros2: type[Ros2], partner: Partner
 ) -> None:
     partner.heard.clear()
@@ -168,7 +168,7 @@ def test_parameters_are_read_and_set(ros2: type[Ros2]) -> None:
     assert ros2("param", "get", "/rig/partner", "speed").out == "Double value is: 0.25\n"
 
 
-def test_an_answer_that_never_comes_is_told(domain: int, ros2: type[Ros2]) -> None:
+def test_a_missing_answer_is_reported(domain: int, ros2: type[Ros2]) -> None:
     context = Context()
     rclpy.init(context=context, domain_id=domain)
     deaf = Node("deaf", context=context)  # never spun
@@ -198,9 +198,7 @@ def test_an_answer_that_never_comes_is_told(domain: int, ros2: type[Ros2]) -> No
         (("param", "get", "/rig/partner", "nothing"), "Parameter not set"),
     ],
 )
-def test_says_in_one_line_what_is_wrong(
-    ros2: type[Ros2], arguments: tuple[str, ...], words: str
-) -> None:
+def test_errors_are_one_line(ros2: type[Ros2], arguments: tuple[str, ...], words: str) -> None:
     said = ros2(*arguments)
     assert said.code == 1
     assert words in said.err

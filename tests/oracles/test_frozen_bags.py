@@ -29,7 +29,7 @@ def test_every_frozen_bag_is_run_again() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_controller_does_what_was_recorded(
+def test_the_controller_reproduces_the_recorded_output(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     counts = read_contents(BAGS / name).counts

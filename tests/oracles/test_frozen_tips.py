@@ -140,7 +140,7 @@ def test_joints_lead_the_needle_to_the_frozen_poses(rig: FrozenRig) -> None:
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_pairs_drawn_anew_look_as_the_frozen_ones(rig: FrozenRig, side: str) -> None:
+def test_rendered_pairs_look_like_the_frozen_ones(rig: FrozenRig, side: str) -> None:
     with np.load(ORACLES / "pairs.npz") as pairs:
         difference = np.abs(np.array(rig.images[side]) - pairs[side])
     assert difference.shape[0] == PAIRS
@@ -149,7 +149,7 @@ def test_pairs_drawn_anew_look_as_the_frozen_ones(rig: FrozenRig, side: str) -> 
     assert difference.max() < 0.05
 
 
-def test_pairs_drawn_anew_have_the_frozen_tips(run: Run, rig: FrozenRig) -> None:
+def test_rendered_pairs_have_the_frozen_tips(run: Run, rig: FrozenRig) -> None:
     assert [tip.stamp_ns for tip in rig.tips] == run.tips.stamps[:PAIRS].tolist()
     for tip, frozen in zip(rig.tips, run.tips.values, strict=False):
         assert math.dist(tip.position, frozen) < TOLERANCE

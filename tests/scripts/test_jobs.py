@@ -34,13 +34,13 @@ def test_a_signal_ends_script_and_child(number: signal.Signals) -> None:
         os.kill(child, 0)
 
 
-def test_the_exit_code_of_a_command_comes_through() -> None:
+def test_the_exit_code_of_a_command_is_passed_on() -> None:
     words = ["bash", "-c", f". '{JOBS}'; run false; echo $code; run true; echo $code"]
     assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "1\n0\n"
 
 
 @pytest.mark.parametrize("script", ["simulate", "console", "verify", "paper", "bench", "test"])
-def test_every_script_that_starts_others_runs_them_so(script: str) -> None:
+def test_every_script_that_starts_others_forwards_signals(script: str) -> None:
     text = (JOBS.parents[1] / script).read_text("utf-8")
     assert "lib/jobs.sh" in text
     assert "exec python" not in text

@@ -119,7 +119,7 @@ def test_an_interrupted_set_up_is_done_again(checkout: Checkout) -> None:
         ("ros2", "exit 0", {"ROS_DISTRO": "humble"}, "ROS 2 humble is sourced"),
     ],
 )
-def test_what_is_missing_is_said_in_one_line(
+def test_missing_requirements_are_reported_in_one_line(
     checkout: Checkout, stub: str, text: str, variables: dict[str, str], line: str
 ) -> None:
     checkout.add(stub, text)
@@ -128,7 +128,7 @@ def test_what_is_missing_is_said_in_one_line(
     assert len(checkout.printed) == 1
 
 
-def test_where_ros_is_sourced_it_is_used_and_the_workspace_built(checkout: Checkout) -> None:
+def test_sourced_ros_is_used_and_the_workspace_built(checkout: Checkout) -> None:
     (checkout.root / "requirements-apt.lock").touch()
     done = checkout.set_up(code=2, ROS_DISTRO="jazzy")
     assert done == ["venv", "uv -e . --group test --group apt"]

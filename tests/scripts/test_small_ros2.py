@@ -58,7 +58,7 @@ def test_lists_executables(
         (["pkg", "executables", "zzz"], "known: needle_"),
     ],
 )
-def test_says_in_one_line_what_is_wrong(
+def test_errors_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     arguments: list[str],

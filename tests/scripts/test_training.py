@@ -84,7 +84,7 @@ def test_an_end_outside_the_patch_is_none(tmp_path: Path) -> None:
     assert np.isnan(batch.ends).all()
 
 
-def test_a_pool_takes_what_comes_and_forgets_what_goes(folder: Path, tmp_path: Path) -> None:
+def test_a_pool_adds_new_files_and_drops_removed_ones(folder: Path, tmp_path: Path) -> None:
     pool = Pool(tmp_path)
     assert pool.update() == 0
     for name in ("drawn-00000.npz", "traced-00000.npz"):
@@ -146,9 +146,7 @@ def test_a_net_that_diverges_ends_the_run_and_is_not_stored(folder: Path, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_run_is_resumed_exactly_and_opencv_reads_its_net(folder: Path, tmp_path: Path) -> None:
     torch, loop = torch_and_loop()
     pool = Pool(folder)
     paths = tmp_path / "needle_net.onnx", tmp_path / "checkpoint.pt"
@@ -181,7 +179,7 @@ def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
     assert 0.0 < float(wanted[0].min()) < float(wanted[0].max()) < 1.0
 
 
-def test_a_net_from_stored_weights_sees_what_the_stored_one_sees(tmp_path: Path) -> None:
+def test_a_net_from_stored_weights_equals_the_stored_net(tmp_path: Path) -> None:
     torch, loop = torch_and_loop()
     net = pytest.importorskip("training_net")
     path = tmp_path / "needle_net.onnx"

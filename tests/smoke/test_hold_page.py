@@ -111,7 +111,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
             browser.close()
 
 
-def test_mouse_space_bar_and_finger_hold_until_they_are_let_go(scene: Scene) -> None:
+def test_mouse_space_bar_and_finger_hold_until_released(scene: Scene) -> None:
     tab = scene.tab
     scene.ends(scene.hold_pointer, lambda: tab.release_pointer(*BUTTON))
     scene.ends(scene.hold_space, tab.release_space)
@@ -127,7 +127,7 @@ def test_a_second_finger_or_button_or_key_ends_a_hold(scene: Scene) -> None:
     scene.ends(scene.hold_space, lambda: tab.press_key("Escape"))
 
 
-def test_a_button_or_page_that_goes_ends_its_hold(scene: Scene) -> None:
+def test_a_removed_button_or_page_ends_its_hold(scene: Scene) -> None:
     anew = "for (const old of document.querySelectorAll('button')) old.outerHTML = old.outerHTML"
     scene.ends(scene.hold_pointer, lambda: scene.tab.run(anew))
     # Its replacement is an identical button.
@@ -144,7 +144,7 @@ def test_a_button_or_page_that_goes_ends_its_hold(scene: Scene) -> None:
     scene.tab.release_space()
 
 
-def test_the_page_says_why_a_hold_ended_by_itself(scene: Scene) -> None:
+def test_the_page_gives_the_reason_of_an_ended_hold(scene: Scene) -> None:
     tab = scene.tab
 
     def why() -> str:
@@ -176,7 +176,7 @@ def test_the_page_says_why_a_hold_ended_by_itself(scene: Scene) -> None:
     scene.until_released()
 
 
-def test_what_is_no_press_does_not_hold(scene: Scene) -> None:
+def test_other_events_than_a_press_do_not_hold(scene: Scene) -> None:
     tab = scene.tab
     tab.release_space()
     assert scene.never_pressed(lambda: tab.press_space(repeat=True))

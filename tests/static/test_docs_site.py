@@ -37,7 +37,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
+def test_nothing_is_loaded_from_other_hosts(site: Path) -> None:
     pages = [path.read_text("utf-8") for path in site.rglob("*.html")]
     assert len(pages) > 60
     assert [link for page in pages for link in ELSEWHERE.findall(page)] == []

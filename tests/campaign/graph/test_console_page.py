@@ -214,7 +214,7 @@ def test_another_page_sees_and_can_stop_but_not_move(
     page.mouse.up()
 
 
-def test_a_target_is_changed_in_the_middle_and_nonsense_is_refused(page: Page) -> None:
+def test_a_target_is_changed_while_steering_and_invalid_input_is_rejected(page: Page) -> None:
     press(page, "Set point")
     expect(reading(page, "Reach")).to_contain_text("point")
     offset = page.get_by_label("Plane offset [mm]")
@@ -226,7 +226,7 @@ def test_a_target_is_changed_in_the_middle_and_nonsense_is_refused(page: Page) -
     expect(reading(page, "Reach")).to_contain_text("plane")
 
 
-def test_the_needle_is_drawn_out_by_a_hold_too(page: Page) -> None:
+def test_the_needle_is_withdrawn_by_a_hold(page: Page) -> None:
     page.locator("[data-hold=retract]").hover()
     hold_until(page, page.mouse.down, page.mouse.up, "< 1")
     page.mouse.up()

@@ -36,7 +36,7 @@ def test_a_file_is_read_from_the_entry_on_and_forecast(tmp_path: Path) -> None:
     assert inside
 
 
-def test_what_is_too_short_or_of_another_kind_is_left_out(tmp_path: Path) -> None:
+def test_short_or_unsuitable_files_are_left_out(tmp_path: Path) -> None:
     assert place_at(tips_of(write(tmp_path / "exp.csv", 0.09)), 0.098) is None
     (tmp_path / "other.csv").write_text("a,b\n1,2\n", encoding="utf-8")
     with pytest.raises(UserError, match="wants columns"):

@@ -74,7 +74,7 @@ def test_swapped_images_are_suspected(
 @pytest.mark.parametrize(
     "scenario", ["clean", "clutter", "heavy_clutter", "occlusion", "absent", "defocus"]
 )
-def test_images_as_they_should_be_are_not(
+def test_correct_images_are_not_suspected(
     looks: Looks, calibration_path: Path, scenario: str, known: bool
 ) -> None:
     for insertion, left, right in pairs(calibration_path, scenario, 2, 60):

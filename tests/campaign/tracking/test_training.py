@@ -42,9 +42,7 @@ def trained(tmp_path: Path, *words: str) -> str:
     return done.stdout
 
 
-def test_a_training_goes_on_from_weights_and_from_a_checkpoint(
-    tmp_path: Path, recording: Path
-) -> None:
+def test_a_training_continues_from_weights_or_a_checkpoint(tmp_path: Path, recording: Path) -> None:
     pytest.importorskip("torch", reason="PyTorch is an extra: docs/dependencies.md")
     pytest.importorskip("onnx", reason="ONNX is an extra: docs/dependencies.md")
     output = tmp_path / "net.onnx"

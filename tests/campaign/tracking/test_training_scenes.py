@@ -34,7 +34,7 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
     return batch_of([(read_shard(path), i) for i in range(count)], [0] * count, [False] * count)
 
 
-def test_the_stored_net_shows_needles_that_it_was_not_trained_on(unseen: Batch) -> None:
+def test_the_stored_net_detects_unseen_needles(unseen: Batch) -> None:
     net = cv2.dnn.readNetFromONNX(str(WEIGHTS))
     rows, columns = np.indices((SIZE, SIZE))
     shown, excess, at_ends, without = [], [], [], []
@@ -59,7 +59,7 @@ def test_the_stored_net_shows_needles_that_it_was_not_trained_on(unseen: Batch) 
     assert abs(np.mean(excess)) < 0.01
 
 
-def test_a_traced_scene_says_where_its_shaft_is() -> None:
+def test_a_traced_scene_gives_the_position_of_its_shaft() -> None:
     pytest.importorskip("mitsuba", reason="Mitsuba is an extra: docs/dependencies.md")
     try:
         mitsuba = load_mitsuba()

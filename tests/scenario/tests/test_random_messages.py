@@ -65,7 +65,7 @@ class Careless(Component):
 
 
 @pytest.mark.parametrize("level", ["drive", "camera"])
-def test_nothing_that_a_rig_is_sent_fails_or_moves_it(level: str) -> None:
+def test_random_messages_neither_fail_nor_move_a_rig(level: str) -> None:
     parameters = command_line_parameters(parse(["--level", level]), Path())
     parts = [
         *make_rig(parameters),

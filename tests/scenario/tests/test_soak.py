@@ -41,7 +41,7 @@ def ended(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("ended")
-def test_what_is_interrupted_says_how_far_it_came(
+def test_an_interrupted_soak_reports_its_progress(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     figures, kept = tmp_path / "soak.json", tmp_path / "failures"

@@ -58,7 +58,7 @@ MESSAGES = (
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
-def test_a_message_goes_there_and_back_with_and_without_ros_and_across(message: Any) -> None:
+def test_a_message_round_trips_with_and_without_ros_and_across(message: Any) -> None:
     kind = ros_type(type(message))
     written = STORE.serialize_cdr(Converter(rosbags_types(STORE)).to_ros(message), kind)
     assert from_ros(type(message), STORE.deserialize_cdr(written, kind)) == message
@@ -78,7 +78,7 @@ def test_a_plain_marker_looks_like_an_obstacle() -> None:
     assert (stamp.sec, stamp.nanosec, list(marker.points)) == (0, 0, [])
 
 
-def test_a_hold_s_frame_is_its_source_and_session() -> None:
+def test_the_frame_of_a_hold_is_its_source_and_session() -> None:
     joy = rclpy_types().make("sensor_msgs/msg/Joy")()
     joy.header.stamp.nanosec = 7
     for frame_id, source, session in (

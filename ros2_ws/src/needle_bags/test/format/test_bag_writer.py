@@ -106,7 +106,7 @@ class _BrokenFile(io.FileIO):
         raise OSError(errno.EIO, "Input/output error")
 
 
-def test_a_disk_that_refuses_data_is_an_error_at_the_start(
+def test_a_failing_disk_is_reported_at_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The error comes before the run, and the next attempt can use the same folder."""
@@ -121,7 +121,7 @@ def test_a_disk_that_refuses_data_is_an_error_at_the_start(
     open_recording(tmp_path / "bag").close()
 
 
-def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_an_error(
+def test_a_recording_ends_cleanly_before_a_full_disk_or_after_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The end of the writing thread must be reported, or later messages would wait forever."""

@@ -227,7 +227,7 @@ def test_topic_selection_and_invalid_parameters() -> None:
             RecorderParameters(**{name: value})
 
 
-def test_a_recorder_that_cannot_start_leaves_a_bag_that_is_whole(
+def test_a_recorder_that_cannot_start_leaves_a_complete_bag(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> None:

@@ -79,6 +79,6 @@ def test_published_transforms_are_those_of_the_urdf(calibration: StereoCalibrati
 
 
 @pytest.mark.parametrize("text", ["", "<robot>", "<robot><joint type='fixed'/></robot>"])
-def test_another_file_is_no_urdf(text: str) -> None:
+def test_other_files_are_rejected_as_urdf(text: str) -> None:
     with pytest.raises(UserError, match="not a URDF: "):
         joint_attributes(text)

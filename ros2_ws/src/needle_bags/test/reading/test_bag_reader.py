@@ -119,7 +119,7 @@ def other_distribution(path: Path) -> None:
         (other_distribution, r"as ROS 2 Jazzy has it \(bag of humble"),
     ],
 )
-def test_a_bag_without_a_readable_run_is_one_line(
+def test_a_bag_without_a_readable_run_gives_a_one_line_error(
     tmp_path: Path, make: Callable[[Path], None], words: str
 ) -> None:
     make(tmp_path / "bag")

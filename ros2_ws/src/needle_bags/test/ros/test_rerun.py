@@ -123,7 +123,7 @@ def test_a_parameter_off_by_a_hundredth_is_detected(
     assert field in changed_fields(result)
 
 
-def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) -> None:
+def test_another_preset_gives_a_separate_run(eight_steps: Path, paper_bag: Path) -> None:
     code, said = printed(paper_bag)
     assert code == 0
     assert "(paper)" in said

@@ -140,7 +140,7 @@ def test_a_key_down_at_the_start_must_be_pressed_again() -> None:
     assert desk.held() is HoldKind.INSERT
 
 
-def test_events_that_the_kernel_dropped_may_have_been_a_release() -> None:
+def test_events_dropped_by_the_kernel_may_include_a_release() -> None:
     desk = Desk()
     desk.read()
     desk.do(KEY, DOWN)

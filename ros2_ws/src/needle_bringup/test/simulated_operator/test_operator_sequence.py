@@ -209,7 +209,7 @@ def test_statuses_before_the_start_are_ignored() -> None:
         assert sequence.outcome.code == 0
 
 
-def test_a_start_that_ends_immediately() -> None:
+def test_a_start_that_ends_immediately_fails_the_run() -> None:
     """STEERING, then IDLE: a latched status of depth 1 may show only the second."""
     for state, overtakes in itertools.product(("FAULT", "IDLE"), (False, True)):
         sequence = fresh()

@@ -73,7 +73,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(node_graph, "TERMINATE_GRACE", 0.0)
 
 
-def test_every_executable_is_a_node_that_parameter_files_know() -> None:
+def test_every_executable_is_a_known_node_of_parameter_files() -> None:
     assert {name for _, name, _ in executables("node")} == set(NODES)
 
 

@@ -81,7 +81,7 @@ def study(folder: Path, words: str) -> tuple[dict[str, Any], list[dict[str, str]
         return json.loads((folder / "f.json").read_text("utf-8")), list(csv.DictReader(stream))
 
 
-def test_open_loop_s_known_answer_in_json_and_csv(tmp_path: Path) -> None:
+def test_the_known_result_of_open_loop_is_in_json_and_csv(tmp_path: Path) -> None:
     words = "--controller open_loop --initial -3,2,15 --draws 1 --slip 0.0 --seed 5"
     figures, rows = study(tmp_path, words)
     assert set(figures) >= KEYS

@@ -106,7 +106,7 @@ def test_python_and_compiled_loops_give_the_same_bits() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_the_belief_is_that_of_the_estimates() -> None:
+def test_the_belief_follows_from_the_estimates() -> None:
     needles = SteeredNeedles(
         lambda count: BestEstimators(FilterSettings(), count, 0.001), each_rate(lambda _: still)
     )

@@ -72,7 +72,7 @@ def test_a_sample_and_its_labels_are_rotated_and_scaled_alike() -> None:
     assert ends > 10
 
 
-def test_half_of_the_samples_know_a_background_of_the_same_camera() -> None:
+def test_half_of_the_samples_have_a_background_of_the_same_camera() -> None:
     scene = bars(4.0)
     samples = [traced_patch(np.random.default_rng(seed), [scene]) for seed in range(60)]
     known = [sample for sample in samples if sample.background is not None]

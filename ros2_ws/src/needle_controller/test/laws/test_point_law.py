@@ -58,7 +58,7 @@ def free() -> PointLaw:
     return law(max_rotation_per_length=1e5, largest_turn=100.0)
 
 
-def test_the_need_of_a_point_is_the_arc_that_leads_there() -> None:
+def test_the_need_of_a_point_is_the_bending_of_its_arc() -> None:
     need, length = np.empty(2), 0.08
     for share in (0.1, 0.9):
         curvature = share * CURVATURE
@@ -72,7 +72,7 @@ def test_the_need_of_a_point_is_the_arc_that_leads_there() -> None:
     assert write_need(np.array([0.0, 0.0, 0.05]), need) == 0.05
 
 
-def test_what_no_arc_leads_to_is_nearest_after_what_is_said() -> None:
+def test_an_unreachable_point_is_nearest_at_the_returned_length() -> None:
     """The oracle searches the arcs of all curvatures up to the needle's."""
     lengths, bend = np.linspace(0.0, 0.1, 2001)[:, None], np.linspace(1e-6, CURVATURE, 51)
     x, z = (1.0 - np.cos(bend * lengths)) / bend, np.sin(bend * lengths) / bend
@@ -83,7 +83,7 @@ def test_what_no_arc_leads_to_is_nearest_after_what_is_said() -> None:
         assert found == pytest.approx(lengths[nearest, 0], abs=1e-4)
 
 
-def test_what_is_left_of_a_need_is_the_integral_of_the_bending() -> None:
+def test_the_rest_of_a_need_follows_from_the_integral_of_the_bending() -> None:
     left, length, need = 0.03, 0.007, np.array([0.002, -0.001])
     for rate in (0.0, 1e-7, 200.0, -523.0):
 
@@ -96,7 +96,7 @@ def test_what_is_left_of_a_need_is_the_integral_of_the_bending() -> None:
         np.testing.assert_allclose(rest, expected, atol=1e-10)
 
 
-def test_turns_the_shorter_way_to_where_the_needle_bends_to_the_point() -> None:
+def test_the_bevel_takes_the_shorter_turn_towards_the_point() -> None:
     for around in np.deg2rad([10.0, 100.0, -60.0, 170.0]):
         # Near the edge of the reachable region: no waiting; without roll it bends towards -y.
         target = [0.035 * np.cos(around), 0.035 * np.sin(around), 0.10]
@@ -107,7 +107,7 @@ def test_turns_the_shorter_way_to_where_the_needle_bends_to_the_point() -> None:
 
 
 @pytest.mark.parametrize("budget_deg", [0.0, 100.0, 360.0, 1e9])
-def test_a_budget_is_kept_and_two_half_turns_lead_to_the_point(budget_deg: float) -> None:
+def test_the_turn_budget_is_kept_and_two_half_turns_reach_the_point(budget_deg: float) -> None:
     pose, target, budget = entry(), [0.01, -0.003, 0.09], np.deg2rad(budget_deg)
     point_law, rotation = law(), 0.0
     for _ in range(200):
@@ -134,7 +134,7 @@ def next_turn(left: float, kept: float) -> float:
     return float(brentq(beyond, 0.0, left))
 
 
-def test_what_is_kept_back_takes_all_half_turns_to_the_last_turn() -> None:
+def test_the_reserve_lets_all_half_turns_end_at_the_last_turn() -> None:
     last_turn = 0.008
     for half_turns in (1, 2, 5):
         left = 0.1
@@ -145,7 +145,7 @@ def test_what_is_kept_back_takes_all_half_turns_to_the_last_turn() -> None:
     assert affordable_reserve(0.1, math.inf, last_turn) == 1.0
 
 
-def test_waits_while_a_later_turn_will_do_and_no_longer() -> None:
+def test_a_turn_waits_as_long_as_a_later_one_suffices() -> None:
     # While it bends towards the point, it is not turned.
     arc = moved(entry(70.0), 0.08, 0.0)
     command = law()(estimate(entry(70.0)), arc[:3, 3])
@@ -181,7 +181,7 @@ def test_each_hypothesis_turns_from_its_own_roll_through_its_play_and_may_unwind
     assert law(scatter_dead_band=3.0)(scattered, ASIDE).rotation_rate == 0.0
 
 
-def test_torsion_makes_it_turn_in_time() -> None:
+def test_torsion_makes_the_turn_start_earlier() -> None:
     def waits_until(needle: Estimate) -> float:
         """Return the distance of a point straight ahead at which the bevel is turned [m]."""
         ahead = np.arange(0.1, 0.0, -0.001)
@@ -192,7 +192,7 @@ def test_torsion_makes_it_turn_in_time() -> None:
         assert waits_until(mixture([0.0], **columns)) > waits_until(mixture([0.0])) + 0.001
 
 
-def test_many_needles_are_steered_as_each_alone() -> None:
+def test_many_needles_equal_single_ones() -> None:
     filters = ManyFilters(FilterSettings(), 3, STEP)
     filters.start(np.array([[0.001, 0.0, 0.0], [0.0, 0.0005, 0.0], [-0.001, 0.0, 0.0]]))
     filters.advance(np.full(3, STEP), np.array([0.1, -0.4, 1.0]))

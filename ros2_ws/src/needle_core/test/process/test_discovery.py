@@ -64,7 +64,7 @@ def test_the_discovery_range_decides_with_and_without_shared_memory(
     assert kept() == {DISCOVERY_RANGE: "LOCALHOST", PROFILES: str(THIS_MACHINE)}
 
 
-def test_profiles_of_the_users_own_stay_and_are_named(
+def test_profiles_of_the_user_stay_and_are_named(
     own: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for shared_memory in (True, False):

@@ -72,7 +72,7 @@ def test_the_needle_ends_at_the_tip(rig: StereoRig) -> None:
         assert np.polyval(line, 0.0) == pytest.approx(float(v), abs=0.1)
 
 
-def test_noise_is_the_scenario_s_and_new_in_every_exposure_camera_and_seed(rig: StereoRig) -> None:
+def test_noise_follows_the_scenario_and_differs_by_exposure_camera_and_seed(rig: StereoRig) -> None:
     rig = small(rig)
     for level in (3.0, 5.0):
         scenario = dataclasses.replace(CLEAN, noise=level)

@@ -41,7 +41,7 @@ def coordinates_rate(_: float, q: np.ndarray, rotation_rate: float) -> np.ndarra
     )
 
 
-def test_the_plant_follows_the_paper_s_coordinate_equations() -> None:
+def test_the_plant_follows_the_coordinate_equations_of_the_paper() -> None:
     pitch, roll = np.deg2rad([2.0, 15.0])
     plant = needle(pitch, roll)
     q = np.array([0.0, 0.0, 0.0, 0.0, pitch, roll])
@@ -100,7 +100,7 @@ def test_splitting_a_step_changes_neither_pose_nor_torsion() -> None:
     assert float(parts.insertion) == pytest.approx(0.05)
 
 
-def test_retraction_returns_along_the_path_and_with_the_rotation_undone_the_whole_pose() -> None:
+def test_retraction_follows_the_path_back_and_undone_rotation_restores_the_pose() -> None:
     reference, poses = needle(), []
     for turned in TURNS:
         poses.append(reference.T_rig_tip)

@@ -54,7 +54,7 @@ def bent_line() -> tuple[np.ndarray, np.ndarray]:
     return line, aside
 
 
-def test_a_pixel_s_ray_meets_the_point_projected_there(boxes: list[StereoRig]) -> None:
+def test_the_ray_of_a_pixel_meets_the_point_projected_there(boxes: list[StereoRig]) -> None:
     for rig, camera in cameras([RIG, TOP_AND_SIDE, *boxes]):
         columns = np.linspace(0.0, camera.image_width - 1.0, 9)
         lines = np.linspace(0.0, camera.image_height - 1.0, 7)
@@ -83,7 +83,7 @@ def test_a_box_is_seen_through_walls_that_end(boxes: list[StereoRig]) -> None:
         assert np.abs(away).max(initial=0.0) < 1e-12
 
 
-def test_before_the_phantom_rays_go_straight_on() -> None:
+def test_rays_are_straight_in_front_of_the_phantom() -> None:
     rays = refracted_rays([[5.0, 300.0], [500.0, 300.0]], RIG.left, RIG)
     assert rays.origin[0, 2] < 0.0 < rays.origin[1, 2]
     from_centre = rays.origin - RIG.left.centre
@@ -163,7 +163,7 @@ def test_a_box_stands_in_front_of_its_background(boxes: list[StereoRig]) -> None
         assert behind.depth == -look.floor_height
 
 
-def test_lamps_stand_above_and_seem_higher() -> None:
+def test_lamps_are_above_and_appear_higher() -> None:
     for kind in LAMPS:
         for seed in range(5):
             for lamp in place_lamps(kind, np.random.default_rng(seed)):

@@ -75,7 +75,7 @@ def test_noise_that_lasts_has_its_amplitude_and_correlation_at_every_exposure(
         np.testing.assert_allclose(found, wanted, atol=0.05)
 
 
-def test_outliers_are_so_many_so_far_off_in_any_direction() -> None:
+def test_outliers_have_the_requested_share_and_distance_in_any_direction() -> None:
     off = error(Disturbances(noise=0.001, outliers=0.3))
     size = np.linalg.norm(off, axis=1)
     far = size > 0.002
@@ -87,7 +87,7 @@ def test_outliers_are_so_many_so_far_off_in_any_direction() -> None:
     assert 0.00349 < size.max() <= 0.0035
 
 
-def test_dropped_tips_are_missing_whole_and_the_others_untouched() -> None:
+def test_dropped_tips_are_missing_completely_and_others_unchanged() -> None:
     kept = measured(TIPS, Disturbances(noise=0.001), 1, 1, 0)
     seen = measured(TIPS, Disturbances(noise=0.001, found=0.8), 1, 1, 0)
     missing = np.isnan(seen)
@@ -99,7 +99,7 @@ def test_dropped_tips_are_missing_whole_and_the_others_untouched() -> None:
     assert np.all(np.abs(error(all_wrong, exposure=0)) <= 0.001 + 1e-12)
 
 
-def test_bumps_are_of_one_size_in_any_direction_and_patches_uniform_and_anew() -> None:
+def test_bumps_have_one_size_in_any_direction_and_patches_are_uniform_and_independent() -> None:
     moved = bumps(0.002, 1, 0, COUNT)
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 0.002, rtol=1e-9)
     check_isotropic(moved)
@@ -109,7 +109,7 @@ def test_bumps_are_of_one_size_in_any_direction_and_patches_uniform_and_anew() -
     assert np.all(np.abs(np.corrcoef(factors) - np.eye(3)) < FIVE)
 
 
-def test_pushes_are_across_z_in_any_direction_and_roll_steps_normal_and_anew() -> None:
+def test_pushes_are_across_z_in_any_direction_and_roll_steps_normal_and_independent() -> None:
     axes = push_axes(2.0, 1, 0, COUNT)
     np.testing.assert_allclose(np.linalg.norm(axes[:, :2], axis=1), 2.0)
     np.testing.assert_array_equal(axes[:, 2], 0.0)
@@ -147,7 +147,7 @@ def test_a_late_measurement_has_its_age(steps: int) -> None:
             assert age == pytest.approx(0.001 * steps)
 
 
-def test_a_needle_s_numbers_do_not_depend_on_its_company() -> None:
+def test_random_numbers_of_a_needle_do_not_depend_on_other_needles() -> None:
     for first in (40, 41):
         for purpose in (NOISE, CURVATURE):
             whole = uniform_numbers(3, purpose, 7, 0, 100)

@@ -68,7 +68,7 @@ def test_figures_of_known_runs() -> None:
     np.testing.assert_allclose(concatenate(parts).x_end, [0.0, 0.001, 0.002])
 
 
-def test_ends_that_are_far_off_and_trusted_are_counted_on_both_sides() -> None:
+def test_distant_ends_with_high_confidence_are_counted_on_both_sides() -> None:
     distance = np.array([0.0, 0.0049, 0.0051, -0.0051, -0.02])
     assert trusted_far_off(distance, np.zeros(5)) == 3.0
     assert trusted_far_off(distance, np.array([0.0, 0.0, 1.0, 0.0, 1.0])) == 1.0

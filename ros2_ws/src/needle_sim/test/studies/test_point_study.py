@@ -31,7 +31,7 @@ STARTS = GRIDS["random"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)),
 STRAIGHT = StudySettings(1e-6, 0.150, STEP_LENGTH, Disturbances(), seed=1)
 
 
-def test_targets_lie_where_an_arc_of_the_allowed_curvature_leads_and_follow_the_seed() -> None:
+def test_targets_are_at_the_end_of_an_allowed_arc_and_follow_the_seed() -> None:
     targets = random_targets(STARTS, CURVATURE, 3)
     angles = np.column_stack([np.zeros(len(STARTS)), STARTS[:, 1:]])
     off = targets - np.column_stack([STARTS[:, 0], np.zeros((len(STARTS), 2))])
@@ -127,7 +127,7 @@ def test_each_needle_ends_at_its_own_point_with_a_short_last_step() -> None:
     assert found.error[1] == pytest.approx(np.hypot(0.002, 0.0048), abs=1e-6)
 
 
-def test_best_comes_to_points_that_drift_and_breathe() -> None:
+def test_best_reaches_points_that_drift_and_breathe() -> None:
     noisy = StudySettings(CURVATURE, 0.150, STEP_LENGTH, Disturbances(noise=0.001), seed=7)
     places = random_targets(STARTS, CURVATURE, 7)
     near = np.argsort(places[:, 2])[:5]

@@ -35,7 +35,7 @@ def sliding(pose: FloatArray) -> float:
     return float(sliding_mode_rate(pose[:3, :3].T @ (TARGET - pose[:3, 3]), RATE))
 
 
-def test_sliding_mode_turns_the_bevel_the_shorter_way_and_comes_as_near_as_published() -> None:
+def test_sliding_mode_takes_the_shorter_turn_and_is_as_accurate_as_published() -> None:
     for aside in ((1.0, 0.0), (-1.0, 0.0), (0.5, -2.0), (-0.1, 1.0)):
         plant = NeedlePlant(initial_pose(0.0, 0.0), curvature=CURVATURE)
         target = np.array([*aside, 50.0]) * 1e-3
@@ -47,7 +47,7 @@ def test_sliding_mode_turns_the_bevel_the_shorter_way_and_comes_as_near_as_publi
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_a_duty_cycle_spins_for_the_share_that_is_not_to_bend(share: float) -> None:
+def test_a_duty_cycle_spins_for_the_straight_share(share: float) -> None:
     cycle, steps = DutyCycle(RATE, STEP), 600
     ahead = np.array([[0.0, -1.0, share]])
     turned = sum(abs(float(cycle.rates(ahead)[0])) * STEP for _ in range(steps))

@@ -112,7 +112,7 @@ def test_a_pair_exposed_before_the_first_joint_state_has_no_answer(
     assert answering.given == answered
 
 
-def test_the_first_joint_state_is_known_when_it_is_no_longer_kept(answering: Answering) -> None:
+def test_the_first_joint_state_counts_after_it_was_dropped(answering: Answering) -> None:
     for stamp in range(100, 5000):
         answering.joint(stamp)
     answering.pair(99)

@@ -32,7 +32,7 @@ def motion(settings: StereoTrackerParameters) -> NeedleMotion:
     return NeedleMotion.begin(sighting(np.array([0.001, 0.002, 0.05])), settings)
 
 
-def test_the_needle_advances_along_its_heading_by_the_way_of_the_stage(
+def test_the_needle_advances_along_its_heading_by_the_motion_of_the_stage(
     motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
     after = motion.advanced(2e-3, settings.max_curvature)
@@ -44,7 +44,7 @@ def test_the_needle_advances_along_its_heading_by_the_way_of_the_stage(
     assert np.linalg.eigvalsh(back.covariance)[0] > 0.0
 
 
-def test_the_covariance_after_a_way_agrees_with_simulated_needles(
+def test_the_covariance_after_a_motion_agrees_with_simulated_needles(
     motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
     rng, way = np.random.default_rng(0), 5e-3
@@ -59,7 +59,7 @@ def test_the_covariance_after_a_way_agrees_with_simulated_needles(
     )
 
 
-def test_an_unknown_way_spreads_the_tip_along_the_heading_and_beside_it(
+def test_an_unknown_motion_spreads_the_tip_along_the_heading_and_across_it(
     motion: NeedleMotion,
 ) -> None:
     rng, sigma = np.random.default_rng(3), 4e-3

@@ -83,7 +83,7 @@ def test_a_rendered_needle_is_measured_to_some_tenths_of_a_millimetre(
         assert m.tip.direction @ pose[:3, 2] > math.cos(math.radians(8.0))
 
 
-def test_the_needle_is_seen_from_just_beyond_the_entry(
+def test_the_needle_is_detected_from_just_beyond_the_entry(
     tracker: NeedleTracker, calibration_path: Path
 ) -> None:
     exposures = steered(calibration_path, 0.0, 1.0, 2, 9)
@@ -98,7 +98,7 @@ def test_the_needle_is_seen_from_just_beyond_the_entry(
         assert error @ np.linalg.solve(m.tip.covariance, error) < 20.0
 
 
-def test_an_unseen_short_needle_follows_from_the_insertion(
+def test_an_undetected_short_needle_is_placed_by_the_insertion(
     tracker: NeedleTracker, draw_pair: Drawer
 ) -> None:
     """A control loop must continue: only some mm deeper the needle can be detected or missed."""
@@ -162,7 +162,7 @@ def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Draw
         assert measured.state is TrackState.SEARCHING
 
 
-def test_one_blocked_camera_loses_the_track_until_it_sees_again(
+def test_a_blocked_camera_loses_the_track_until_it_is_clear(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
     left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
@@ -177,7 +177,7 @@ def test_one_blocked_camera_loses_the_track_until_it_sees_again(
     assert again.tip is not None
 
 
-def test_without_an_encoder_a_needle_that_went_on_unseen_is_found_again(
+def test_without_an_encoder_a_needle_that_advanced_undetected_is_found_again(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
     for mm in range(48, 52):
@@ -191,7 +191,7 @@ def test_without_an_encoder_a_needle_that_went_on_unseen_is_found_again(
     assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
 
 
-def test_without_an_encoder_a_needle_is_found_beside_an_old_track_that_stands(
+def test_without_an_encoder_a_needle_is_found_beside_an_old_static_track(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
     old, reasons = make_arc(0.045, 5.0, 0.5), []

@@ -86,7 +86,7 @@ def test_a_line_of_paper_along_the_needle_does_not_bias_the_tip(
         assert tip is None or np.linalg.norm(tip.position - truth) < 1e-3
 
 
-def test_without_the_insertion_nothing_over_graph_paper_is_believed_at_once_or_wrongly(
+def test_without_the_insertion_no_tip_over_graph_paper_is_immediate_or_wrong(
     calibration: StereoCalibration,
 ) -> None:
     looks = tracked(calibration, "steel_on_graph_paper", empty=True, insertion=False)
