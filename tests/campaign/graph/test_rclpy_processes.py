@@ -166,7 +166,7 @@ class Desk:
 
 
 @pytest.mark.parametrize("number", ENDING_SIGNALS)
-def test_a_signal_ends_no_worker_and_reaches_the_parent(number: signal.Signals) -> None:
+def test_a_signal_ends_no_worker_and_is_not_blocked_in_the_parent(number: signal.Signals) -> None:
     with start_worker(Desk.put, "images") as worker:
         process, there = worker.submit(Desk.tell).result()
         assert there == "images"
