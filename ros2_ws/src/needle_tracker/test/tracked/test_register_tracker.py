@@ -45,8 +45,7 @@ def test_the_claimed_error_is_that_of_many_registrations() -> None:
             inside.append(error @ np.linalg.solve(covariance, error) < 14.16)
         left_out.append(np.mean(errors**2))
     true, claimed = np.mean(squares, axis=0)
-    # By Student's t with 12 degrees of freedom, the claim is 12
-    # 10 of the mean.
+    # By Student's t with 12 degrees of freedom, the claim is 12 / 10 of the mean.
     assert claimed / true == pytest.approx(1.2, rel=0.2)
     assert np.mean(inside) > 0.98
     # The error of a left-out point itself is added.
