@@ -51,8 +51,8 @@ class Violation:
     ----------
     invariant : str
         Its name.
-    Time from the start of the run [s].
-        When, from the start of the run [s].
+    at : float
+        Time from the start of the run [s].
     text : str
         Observation, with values and units.
     """
