@@ -1,1 +1,1 @@
-"""Checks of what the steps of the project must show, at full size."""
+"""Full-size checks of the steps of the project."""

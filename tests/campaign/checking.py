@@ -113,7 +113,7 @@ class Workbench:
     command : sequence of str
         Command of `simulate`.
     folder : Path
-        For the bags.
+        Folder of the bags.
     """
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:

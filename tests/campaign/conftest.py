@@ -1,4 +1,4 @@
-"""The campaign runs when it is asked for: `scripts/test -m campaign`, or `scripts/verify`."""
+"""Campaign tests run only on request: `scripts/test -m campaign` or `scripts/verify`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what stands in this folder."""
+    """Mark the tests of this folder."""
     for item in items:
         if item.path.is_relative_to(HERE):
             item.add_marker("campaign")

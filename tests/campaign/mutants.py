@@ -24,8 +24,8 @@ from needle_core.commands.options import CommandParser
 
 SOURCES = "ros2_ws/src"
 WANTED = 0.9
-"""Share of the mutants that the tests must notice."""
-# With annotations that are not evaluated, another operator between types changes nothing.
+"""Share of the mutants that the tests must detect."""
+# Annotations are not evaluated: another operator between types has no effect.
 OF_TYPES = "core/ReplaceBinaryOperator_BitOr"
 
 DESCRIPTION = f"""\
@@ -44,11 +44,11 @@ class Target:
     Attributes
     ----------
     package : str
-        Whose.
+        Name of the package.
     rooms : tuple of str
-        Which.
+        Folders of the package whose code is changed.
     tests : tuple of str
-        Test files and folders that must notice, relative to the package's `test`.
+        Test files and folders that must detect the changes, relative to the package's `test`.
     """
 
     package: str
@@ -117,7 +117,7 @@ def _mutants(root: Path) -> Iterator[tuple[Target, WorkItem]]:
 def _survivors(
     chosen: Sequence[tuple[Target, WorkItem]], clones: Sequence[Path], timeout: float
 ) -> Iterator[str]:
-    """Yield the changes that no test noticed."""
+    """Yield the changes that no test detected."""
     free: SimpleQueue[Path] = SimpleQueue()
     for clone in clones:
         free.put(clone)

@@ -18,7 +18,7 @@ CHECKS = [
 
 
 @pytest.mark.parametrize("check", CHECKS)
-def test_a_step_shows_what_it_must(check: Check, tmp_path: Path) -> None:
+def test_a_step_meets_its_requirements(check: Check, tmp_path: Path) -> None:
     bench = Workbench([str(checkout() / "scripts" / "simulate")], tmp_path)
     missed = [finding for finding in check(bench) if not finding.passed]
     assert missed == []

@@ -1,4 +1,4 @@
-"""No machine code is made while a needle is steered: it would wait for that."""
+"""No code is compiled while a needle is steered, which would delay it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ assert ahead and compiled() == ahead, (ahead, compiled())
 
 @pytest.mark.parametrize("preset", ["best", "paper"])
 def test_nothing_is_compiled_while_a_needle_is_steered(preset: str) -> None:
-    """In a process of its own: what another test has compiled hides what is missing."""
+    """Run in a separate process, because code compiled by other tests would hide missing code."""
     command = [sys.executable, "-c", NEVER_COMPILED, preset]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr

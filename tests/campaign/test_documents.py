@@ -1,4 +1,4 @@
-"""README and docs, typed word for word against the simulated rig; only insertions are shorter."""
+"""README and docs, executed word for word on the simulated rig, with shorter insertions."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from needle_core.process.ros_domain import reserve_domain_id
 from needle_tracker.calibrating.calibration_session import parse_session
 
 SHORT_MM = 6
-# From which a curvature is told.
+# Insertion that determines a curvature [mm].
 ARC_MM = 12
 SHARED = ("README.md", "docs", "ros2_ws")
 
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """Return a folder that looks like this checkout, but has bags of its own."""
+    """Return a folder of links to this checkout, with its own bags."""
     folder = tmp_path / "needle"
     (folder / "bags").mkdir(parents=True)
     for name in SHARED:
@@ -31,7 +31,7 @@ def checkout(tmp_path: Path) -> Path:
     (folder / "scripts").mkdir()
     for path in (ROOT / "scripts").iterdir():
         (folder / "scripts" / path.name).symlink_to(path)
-    # Under another path, numerical code would be compiled anew.
+    # In another folder, numerical code would be compiled again.
     (folder / "scripts" / "env.sh").unlink()
     (folder / "scripts" / "env.sh").write_text(f". '{ROOT}/scripts/env.sh'\n")
     (folder / "bags" / "README.md").symlink_to(ROOT / "bags" / "README.md")
@@ -40,27 +40,27 @@ def checkout(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def runs() -> dict[str, str]:
-    """Return the bag of each command line of `simulate` that a page had, without --bag."""
+    """Return the bag of each executed command line of `simulate`, without --bag."""
     return {}
 
 
 def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
-    """Return what makes insertions short, keeps files out of the way, and lets drives go first."""
+    """Return a function that shortens insertions, redirects files, and gives drives priority."""
     numbers = count()
 
     def change(command: str) -> str:
         command = command.replace("/tmp/", f"{scratch}/")
         if "docs/examples/" in command and "\n" in command:
-            # A run of a few seconds, nodes and all.
+            # A run of a few seconds, including its nodes.
             return command
         if "plane_controller" in command:
             return f"{command} -p depth:=0.00{SHORT_MM}"
         if re.search(r"ros2 run \S+ (device_driver|drive_emulator) ", command):
-            # In real time, whatever the other lane does: a rig gives its driver a machine that is
-            # not busy. Without the right to go first it goes with the rest.
+            # In real time, whatever else runs here: a rig gives its driver a machine that is not
+            # busy. Without the right to raise its priority, it runs with the normal one.
             return f"nice -n -10 {command}"
         if "pip install" in command:
-            # A link into the environment would stay behind: a copy, whose modules are links.
+            # Copy the package and link its modules: an editable installation would leave a link.
             folder = command.split()[-1]
             name = Path(folder).name
             copied = command.replace(f"--editable {folder}", f"{scratch}/{name}")
@@ -85,14 +85,14 @@ def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
         if bag.startswith("/"):
             runs[words] = bag
         words += f" --bag {bag}"
-        # So short a needle may not have reached the plane.
+        # Such a short insertion may not reach the plane.
         return f"{words}; test $? -le 1"
 
     return change
 
 
-def test_the_session_of_a_box_is_one() -> None:
-    """Its board is seen from above and from aside; no rig of ours draws it for the page."""
+def test_the_box_session_is_valid() -> None:
+    """Its board is visible from above and from the side; no synthetic rig draws it for the page."""
     page = blocks((ROOT / "docs/calibration.md").read_text("utf-8"))
     (text,) = (block.text for block in page if block.name == "box_session.yaml")
     session = parse_session(yaml.safe_load(text))
@@ -109,7 +109,7 @@ def test_every_block_works_as_written(
     scratch = tmp_path / "t"
     scratch.mkdir()
     with reserve_domain_id() as domain:
-        # What a page has installed is there for the page alone.
+        # Packages installed by a page are available to that page only.
         own = f"{scratch}/own"
         environment = {
             **os.environ,

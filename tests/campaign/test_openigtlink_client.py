@@ -1,4 +1,4 @@
-"""pyigtl's own client at the real port of openigtlink, as Slicer would be."""
+"""pyigtl's client at the real port of openigtlink, in the role of Slicer."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ AT = Moment(0.0, 7_000_000_000)
 
 
 class Scene:
-    """The component at its real port, and a client as Slicer is one: neither ROS nor virtual."""
+    """The component at its real port, and a client outside of ROS, like Slicer."""
 
     def __init__(self, client: Any) -> None:
         self.component = OpenIGTLink(OpenIGTLinkParameters(port=0))
@@ -43,7 +43,7 @@ class Scene:
         list(row.handler(message, AT))
 
     def hears(self, name: str) -> Any:
-        """Return the next message of a name."""
+        """Return the next message with a name."""
         return self.awaits(lambda: self.client.wait_for_message(name, timeout=0))
 
     def awaits(self, condition: Callable[[], Any]) -> Any:
@@ -65,7 +65,7 @@ class Scene:
         self.port.close()
 
 
-def test_pyigtls_client_hears_the_needle_in_mm() -> None:
+def test_pyigtls_client_receives_the_needle_in_mm() -> None:
     pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
     with contextlib.closing(Scene(pyigtl.OpenIGTLinkClient)) as scene:
         assert scene.hears("NeedleStatus").string == "no needle data received"

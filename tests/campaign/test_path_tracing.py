@@ -1,4 +1,4 @@
-"""The tracer itself, where it is installed: an extra, which `scripts/test` does not bring along."""
+"""The path tracer, if it is installed: an extra that `scripts/test` does not install."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ POINTS = np.array([[0.0, 0.0, 0.03], [0.012, 0.03, 0.09], [-0.014, -0.035, 0.12]
 
 
 class BareScene(NamedTuple):
-    """What `PathTracer` needs of a scene."""
+    """Scene data that `PathTracer` needs."""
 
     tracer: Any
     floors: list[Any]
@@ -45,7 +45,7 @@ def mitsuba() -> Mitsuba:
 
 
 def quarter_size(rig: StereoRig) -> StereoRig:
-    """Return the rig with images of a quarter of the sides."""
+    """Return the rig with images of a quarter of the width and height."""
 
     def smaller(camera: SimulatedCamera) -> SimulatedCamera:
         matrix = camera.camera_matrix.copy()
@@ -57,7 +57,7 @@ def quarter_size(rig: StereoRig) -> StereoRig:
 
 @pytest.mark.parametrize("calibration", [CALIBRATION, TOP_AND_SIDE])
 @pytest.mark.parametrize("point", POINTS)
-def test_a_small_bright_sphere_is_seen_where_snell_s_law_puts_it(
+def test_a_small_bright_sphere_is_imaged_according_to_snells_law(
     mitsuba: Mitsuba, point: np.ndarray, calibration: Path
 ) -> None:
     rig = load_stereo_rig(calibration)
@@ -125,7 +125,7 @@ def test_the_command_fills_a_folder(mitsuba: Mitsuba, tmp_path: Path) -> None:
     assert row["bottom"] != ""
 
 
-def test_what_mirrors_the_floor_mirrors_its_picture(mitsuba: Mitsuba) -> None:
+def test_mirroring_the_floor_mirrors_its_image(mitsuba: Mitsuba) -> None:
     look = dataclasses.replace(draw_appearance("drawn_on_grey", 3), bubbles=0)
     world = make_world(load_stereo_rig(CALIBRATION), look)
     behind = world.backdrops[0]
@@ -170,7 +170,7 @@ def test_a_needle_in_a_box_is_seen_by_both_and_farther_in_by_the_later_one(
     assert np.any(later.images[1] != first.images[1])
 
 
-def test_haze_fades_what_is_deep_and_not_what_is_near(mitsuba: Mitsuba) -> None:
+def test_haze_fades_deep_objects_and_not_near_ones(mitsuba: Mitsuba) -> None:
     rig = quarter_size(load_stereo_rig(CALIBRATION))
     look = dataclasses.replace(
         draw_appearance("painted_on_print", 3), bubbles=0, noise=0.4, lag=0.0, flicker=0.0

@@ -1,4 +1,4 @@
-"""The small `ros2` in a running graph: what it prints, what it sends, how it ends."""
+"""The small `ros2` in a running graph: output, sent messages, exit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LIMIT = 60.0
 
 
 class Partner(Node):
-    """A node to look at and to speak to."""
+    """Node that the tested commands list, call and listen to."""
 
     def __init__(self, context: Context) -> None:
         super().__init__("partner", namespace="rig", context=context)
@@ -103,19 +103,19 @@ class Ros2:
 
 
 def at_once(ros2: type[Ros2], *commands: str) -> list[Ros2]:
-    """Run commands side by side: each waits for seconds."""
+    """Run commands in parallel, because each takes seconds."""
     with ThreadPoolExecutor() as pool:
         return list(pool.map(lambda command: ros2(*shlex.split(command)), commands))
 
 
 def test_lists_nodes_and_topics(ros2: type[Ros2]) -> None:
-    # Another command's node is in the graph, too, but hidden.
+    # The node of another command is also in the graph, but hidden.
     nodes, topics = at_once(ros2, "node list", "topic list")
     assert nodes.out == "/rig/partner\n"
     assert "/rig/hold" in topics.out.splitlines()
 
 
-def test_echo_hears_what_was_said_before_it_came_and_shortens_arrays(ros2: type[Ros2]) -> None:
+def test_echo_receives_earlier_messages_and_shortens_arrays(ros2: type[Ros2]) -> None:
     expected = "stamp:\n  sec: 0\n  nanosec: 0\nframe_id: above\n---\n"
     assert ros2("topic", "echo", "--once", "/rig/status").out == expected
     assert ros2("topic", "echo", "--once", "/rig/status", "--field", "frame_id").out == (
@@ -131,7 +131,7 @@ def test_echo_hears_what_was_said_before_it_came_and_shortens_arrays(ros2: type[
     assert "- '...'\n" in axes
 
 
-def test_pub_sends_so_many_messages_with_stamps_that_increase(
+def test_pub_sends_the_requested_messages_with_increasing_stamps(
     ros2: type[Ros2], partner: Partner
 ) -> None:
     partner.heard.clear()
@@ -168,7 +168,7 @@ def test_parameters_are_read_and_set(ros2: type[Ros2]) -> None:
     assert ros2("param", "get", "/rig/partner", "speed").out == "Double value is: 0.25\n"
 
 
-def test_an_answer_that_never_comes_is_told(domain: int, ros2: type[Ros2]) -> None:
+def test_a_missing_answer_is_reported(domain: int, ros2: type[Ros2]) -> None:
     context = Context()
     rclpy.init(context=context, domain_id=domain)
     deaf = Node("deaf", context=context)  # never spun
@@ -198,9 +198,7 @@ def test_an_answer_that_never_comes_is_told(domain: int, ros2: type[Ros2]) -> No
         (("param", "get", "/rig/partner", "nothing"), "Parameter not set"),
     ],
 )
-def test_says_in_one_line_what_is_wrong(
-    ros2: type[Ros2], arguments: tuple[str, ...], words: str
-) -> None:
+def test_errors_are_one_line(ros2: type[Ros2], arguments: tuple[str, ...], words: str) -> None:
     said = ros2(*arguments)
     assert said.code == 1
     assert words in said.err

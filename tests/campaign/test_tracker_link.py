@@ -1,4 +1,4 @@
-"""The real port of tracked_tip against pyigtl's own server and client, as PLUS is one."""
+"""The real port of tracked_tip against pyigtl's server and client in the role of PLUS."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def opened(port: TransformPort) -> Iterator[list[Any]]:
 
 
 def transform_of(arrived: list[Any], sender: Any) -> LinkMessage:
-    """Let a pyigtl server or client send a transform until the port receives it."""
+    """Send a transform by a pyigtl server or client until the port receives it; return it."""
     stream, deadline = LinkStream("TRANSFORM"), time.monotonic() + LIMIT
     pose, read = np.diag([1.0, -1.0, -1.0, 1.0]), 0
     while True:

@@ -1,4 +1,4 @@
-"""Today's controller on the frozen bags' inputs: what it sends is what was recorded."""
+"""Today's controller on the inputs of the frozen bags: its output is the recorded one."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_every_frozen_bag_is_run_again() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_controller_does_what_was_recorded(
+def test_the_controller_reproduces_the_recorded_output(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     counts = read_contents(BAGS / name).counts

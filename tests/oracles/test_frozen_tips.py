@@ -1,4 +1,4 @@
-"""Pairs of the frozen run at level camera, drawn anew: today's tracker finds the frozen tips.
+"""Pairs of the frozen run at level camera, rendered again: the tracker finds the frozen tips.
 
 Joints determine the needle, and pose, seed and number of an exposure determine its images.
 """
@@ -33,23 +33,23 @@ BAG = ORACLES / "bags" / "camera_best"
 TRUTH = "sim/tip_pose"
 PAIRS = 6
 TOLERANCE = 0.3e-3
-"""The frozen tips are those of the tracker before; both are good to a few tenths of a mm [m]."""
+"""Largest distance from the frozen tips [m]; both trackers are accurate to a few tenths of a mm."""
 BLOCK = 16  # [px]
 
 Floats = npt.NDArray[np.float64]
 
 
 class FrozenRig:
-    """The needle of the frozen run, and today's cameras and tracker at it.
+    """The needle of the frozen run, with today's cameras and tracker.
 
     Attributes
     ----------
     tips : list of Point
-        What the tracker has found.
+        Tips found by the tracker.
     pose_errors : list of float
-        Largest difference of each exposure's pose to the frozen one [m], [-].
+        Largest difference of each exposure's pose from the frozen one [m], [-].
     images : dict of str to list of array
-        What each side was shown.
+        Images of each side.
     """
 
     def __init__(self, run: Run) -> None:
@@ -75,7 +75,7 @@ class FrozenRig:
         self.images: dict[str, list[Floats]] = {"left": [], "right": []}
 
     def take(self, topic: str, message: Any, at: Moment) -> None:
-        """Take a frozen message."""
+        """Handle a frozen message."""
         if topic == TRUTH:
             self._expose(from_ros(Pose, message), at)
             return
@@ -140,7 +140,7 @@ def test_joints_lead_the_needle_to_the_frozen_poses(rig: FrozenRig) -> None:
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_pairs_drawn_anew_look_as_the_frozen_ones(rig: FrozenRig, side: str) -> None:
+def test_rendered_pairs_look_like_the_frozen_ones(rig: FrozenRig, side: str) -> None:
     with np.load(ORACLES / "pairs.npz") as pairs:
         difference = np.abs(np.array(rig.images[side]) - pairs[side])
     assert difference.shape[0] == PAIRS
@@ -149,7 +149,7 @@ def test_pairs_drawn_anew_look_as_the_frozen_ones(rig: FrozenRig, side: str) -> 
     assert difference.max() < 0.05
 
 
-def test_pairs_drawn_anew_have_the_frozen_tips(run: Run, rig: FrozenRig) -> None:
+def test_rendered_pairs_have_the_frozen_tips(run: Run, rig: FrozenRig) -> None:
     assert [tip.stamp_ns for tip in rig.tips] == run.tips.stamps[:PAIRS].tolist()
     for tip, frozen in zip(rig.tips, run.tips.values, strict=False):
         assert math.dist(tip.position, frozen) < TOLERANCE

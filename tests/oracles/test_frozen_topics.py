@@ -1,4 +1,4 @@
-"""Topics of a run on the virtual clock: those of the frozen bags, but for what has a reason."""
+"""Topics of a run on the virtual clock: those of the frozen bags, with listed exceptions."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ GONE = {
     "/device_driver/transition_event": "a component has no lifecycle of ROS",
     "/parameter_events": "parameters are fixed, and stand in the bag's metadata",
 }
-"""Frozen topics that a virtual run does not have, and why."""
+"""Frozen topics that a virtual run lacks, and the reasons."""
 ADDED = {
     "/stereo_tracker/annotated_image": "every output is announced; nobody looks: it stays empty",
     "/needle/proposed_target": "the controller receives it; no planner proposes a target",
     "/needle/planned_path": "the controller plans a path past obstacles only",
 }
-"""Topics that only a virtual run has, and why."""
+"""Topics that only a virtual run has, and the reasons."""
 
 
 @pytest.mark.parametrize("level", ["tip", "camera", "drive"])

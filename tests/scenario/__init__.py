@@ -1,1 +1,1 @@
-"""Whole runs of the rig in one process, under faults, with all that must hold watched."""
+"""Whole runs of the rig in one process under faults, with all invariants checked."""

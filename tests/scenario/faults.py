@@ -55,7 +55,7 @@ SERVICES = (
 BUS, ADAPTER, CAMERAS, CLOCK = "bus", "adapter", "cameras", "system clock"
 PERSON, PARAMETERS = "person", "parameters"
 SECOND_PERSON = "second person"
-"""With a joystick and operator node of their own: keeps it pressed, retracts, presses at random,
+"""Person with a separate joystick and operator node: keeps it pressed, retracts, presses at random,
 loses the joystick during a press."""
 CONSOLE, PAGE, PAGE_LINE = "console", "page", "page line"
 """With a fault of one of these, the operator holds by a page of the console, not the joystick."""

@@ -9,19 +9,19 @@ from scenario.faults import Fault
 
 
 def shrink(faults: Sequence[Fault], still: Callable[[list[Fault]], bool]) -> list[Fault]:
-    """Drop faults, then shorten those that remain, as long as it still happens.
+    """Drop faults, then shorten the others, as long as the violation still occurs.
 
     Parameters
     ----------
     faults : sequence of Fault
-        With which it happens.
+        Faults that cause the violation.
     still : callable
-        Returns whether it happens with others, too.
+        Returns whether other faults cause it, too.
 
     Returns
     -------
     list of Fault
-        None of which can be left out alone.
+        Faults, none of which can be dropped alone.
     """
     kept = list(faults)
     smaller = True

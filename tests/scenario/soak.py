@@ -104,7 +104,7 @@ def _soak(options: argparse.Namespace) -> int:
             if sys.stderr.isatty():
                 print(f"\r{tally.progress}", end="", file=sys.stderr)
     except KeyboardInterrupt:
-        # A night that somebody ends is worth what it has shown.
+        # An interrupted soak reports the finished runs.
         interrupted = True
     if interrupted:
         print(f"interrupted: {tally.progress}")
@@ -118,7 +118,7 @@ def _soak(options: argparse.Namespace) -> int:
 
 def _tell(result: RunResult, folder: Path | None) -> None:
     if result.of_processes:
-        # Real time cannot be had again: as it was, not shrunk.
+        # Real time is not repeatable, so the schedule is not shrunk.
         _print_violations(f"processes, seed {result.seed}", result.violations)
         _print_faults(result.faults)
         return

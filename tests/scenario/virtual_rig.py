@@ -106,7 +106,7 @@ class VirtualRig(ConformanceRig):
         return other
 
     def act(self, other: SecondNode, *actions: Action) -> None:
-        """Let the other node act, and run 0.1 s."""
+        """Execute actions of the other node, and run for 0.1 s."""
         other.actions += actions
         self.runner.run(0.1)
 

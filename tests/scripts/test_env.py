@@ -1,4 +1,4 @@
-"""scripts/env.sh, sourced in a checkout of its own whose path has a space."""
+"""scripts/env.sh, sourced in a separate checkout whose path has a space."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def sourced(name: str, root: Path, times: int = 1, **variables: str) -> dict[str
 def test_sets_the_environment_under_strict_options_from_any_folder(name: str, set_up: Path) -> None:
     before = {"LD_LIBRARY_PATH": "/elsewhere", "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
     env = sourced(name, set_up, 1, **before)
-    # Sourced twice it is the same.
+    # A second call changes nothing.
     assert {**sourced(name, set_up, times=2, **before), "_": ""} == {**env, "_": ""}
     assert env["PATH"].split(":")[0] == str(set_up / ".venv/bin")
     assert env["AMENT_PREFIX_PATH"] == str(set_up / ".venv")
@@ -67,7 +67,7 @@ def test_sets_the_environment_under_strict_options_from_any_folder(name: str, se
 
 
 @pytest.mark.parametrize("name", SHELLS)
-def test_keeps_what_the_user_has_set(name: str, set_up: Path) -> None:
+def test_settings_of_the_user_are_kept(name: str, set_up: Path) -> None:
     env = sourced(
         name,
         set_up,
@@ -94,7 +94,7 @@ def test_another_middleware_is_named_and_replaced(name: str, set_up: Path) -> No
 
 
 @pytest.mark.parametrize("name", SHELLS)
-def test_one_line_where_set_up_has_not_run(name: str, checkout: Path) -> None:
+def test_a_missing_set_up_gives_one_line(name: str, checkout: Path) -> None:
     result = shell(name, f". {str(checkout / 'scripts/env.sh')!r} || echo code $?")
     assert result.stdout == "code 1\n"
     assert result.stderr.splitlines() == [
@@ -102,7 +102,7 @@ def test_one_line_where_set_up_has_not_run(name: str, checkout: Path) -> None:
     ]
 
 
-def test_with_ros_its_own_paths_stay_behind_ours(set_up: Path) -> None:
+def test_paths_of_ros_come_after_ours(set_up: Path) -> None:
     (set_up / ".venv" / ".needle-setup").write_text("apt key key\n")
     env = sourced(
         "bash",

@@ -1,4 +1,4 @@
-"""The examples in docs/examples do what they say: of those that documents do not type."""
+"""Examples in docs/examples that the tests of the pages do not execute."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ NOISE, STEP = SETTINGS.tip_noise_bound, SETTINGS.step_length
 
 @pytest.fixture
 def own(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return what gives the class of a module of the example package."""
+    """Return a function that gives the class of a module of the example package."""
     monkeypatch.syspath_prepend(EXAMPLES / "own_controllers")
 
     def of(module: str, name: str) -> Any:
@@ -62,7 +62,7 @@ def followed(
     return filter_.estimate(), np.array(plant.T_rig_tip)
 
 
-def test_the_particle_filter_knows_where_needles_are_and_how_well(own: Any) -> None:
+def test_the_particle_filter_estimates_needles_and_its_accuracy(own: Any) -> None:
     made_by, rng = own("particle_filter", "ParticleFilter"), np.random.default_rng(2)
     for start in range(4):
         filter_ = made_by(SETTINGS, np.eye(3), np.zeros(3), np.random.default_rng(start))
@@ -86,7 +86,7 @@ def test_pursuit_bends_to_the_plane_from_either_side(own: Any) -> None:
         assert abs(float(wrong)) == pytest.approx(math.pi / STEP)
 
 
-def test_sidestep_leads_beside_what_is_in_the_way(own: Any) -> None:
+def test_sidestep_leads_around_an_obstacle(own: Any) -> None:
     planner = own("sidestep", "Sidestep")(SETTINGS)
     tip, target = entry_state(SETTINGS.curvature), np.array([0.0, 0.0, 0.1])
     free = np.array([[0.05, 0.0, 0.05, 0.05, 0.0, 0.05, 0.003]])
@@ -113,7 +113,7 @@ def test_simulate_takes_the_parameter_files(name: str, warns: bool) -> None:
     assert bool(contradictions(all_of_it, nodes_of(options))) == warns
 
 
-def test_every_parameter_file_is_tried() -> None:
+def test_every_parameter_file_is_tested() -> None:
     page = (EXAMPLES / "README.md").read_text("utf-8")
     for path in (EXAMPLES / "params").iterdir():
         assert f"`{path.name}`" in page
@@ -123,7 +123,7 @@ def test_every_parameter_file_is_tried() -> None:
 def test_a_notebook_runs(notebook: Path) -> None:
     for name in ("pandas", "nbclient", "ipykernel"):
         pytest.importorskip(name, reason="the notebooks' lock is not installed: docs/viewers.md")
-    # In a process: what runs it leaves an event loop behind.
+    # In a separate process: running it leaves an event loop behind.
     run = "import sys; from nbclient.cli import main; sys.exit(main())"
     done = subprocess.run(
         [sys.executable, "-c", run, "--timeout=60", str(notebook)],

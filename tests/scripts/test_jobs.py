@@ -1,4 +1,4 @@
-"""A signal that ends a script ends what it runs, whatever that is doing."""
+"""A signal that ends a script also ends its child processes, whatever they are doing."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ def test_a_signal_ends_script_and_child(number: signal.Signals) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        # what runs the tests may ignore signals in its background
+        # tests may run in a background that ignores signals
         preexec_fn=lambda: [signal.signal(n, signal.SIG_DFL) for n in (1, 2)],  # noqa: PLW1509
     ) as script:
         assert script.stdout is not None
@@ -34,13 +34,13 @@ def test_a_signal_ends_script_and_child(number: signal.Signals) -> None:
         os.kill(child, 0)
 
 
-def test_the_exit_code_of_a_command_comes_through() -> None:
+def test_the_exit_code_of_a_command_is_passed_on() -> None:
     words = ["bash", "-c", f". '{JOBS}'; run false; echo $code; run true; echo $code"]
     assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "1\n0\n"
 
 
 @pytest.mark.parametrize("script", ["simulate", "console", "verify", "paper", "bench", "test"])
-def test_every_script_that_starts_others_runs_them_so(script: str) -> None:
+def test_every_script_that_starts_others_forwards_signals(script: str) -> None:
     text = (JOBS.parents[1] / script).read_text("utf-8")
     assert "lib/jobs.sh" in text
     assert "exec python" not in text

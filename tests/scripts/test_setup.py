@@ -1,4 +1,4 @@
-"""scripts/setup: what it does, what it leaves undone when it can, and what it says.
+"""scripts/setup: its actions, the steps that it skips, and its messages.
 
 It runs for real, with stubs for Python and uv on the PATH: no test downloads anything.
 """
@@ -17,7 +17,7 @@ TOOLS = (
     *("bash", "basename", "cat", "chmod", "cut", "dirname", "env", "flock", "grep", "ls", "mkdir"),
     *("readlink", "rm", "sha256sum", "sort", "touch", "uname", "xargs"),
 )
-# Notes what it is asked for; its virtual environments hold it again, as Python and as uv.
+# Records its arguments; its virtual environments contain it again, as Python and as uv.
 STUB = """\
 case "$*" in
 *ensurepip*) echo "${PREFIX-/usr}" ;;
@@ -61,7 +61,7 @@ class Checkout:
         path.chmod(0o755)
 
     def set_up(self, *arguments: str, code: int = 0, **variables: str) -> list[str]:
-        """Run scripts/setup; return what was asked of Python and uv, then what it printed."""
+        """Run scripts/setup; return the calls of Python and uv, then the output."""
         self.notes.write_text("")
         env = {"PATH": str(self.tools), "HOME": "/nonexistent", "NOTES": str(self.notes)}
         command = [str(self.root / "scripts" / "setup"), *arguments]
@@ -119,7 +119,7 @@ def test_an_interrupted_set_up_is_done_again(checkout: Checkout) -> None:
         ("ros2", "exit 0", {"ROS_DISTRO": "humble"}, "ROS 2 humble is sourced"),
     ],
 )
-def test_what_is_missing_is_said_in_one_line(
+def test_missing_requirements_are_reported_in_one_line(
     checkout: Checkout, stub: str, text: str, variables: dict[str, str], line: str
 ) -> None:
     checkout.add(stub, text)
@@ -128,7 +128,7 @@ def test_what_is_missing_is_said_in_one_line(
     assert len(checkout.printed) == 1
 
 
-def test_where_ros_is_sourced_it_is_used_and_the_workspace_built(checkout: Checkout) -> None:
+def test_sourced_ros_is_used_and_the_workspace_built(checkout: Checkout) -> None:
     (checkout.root / "requirements-apt.lock").touch()
     done = checkout.set_up(code=2, ROS_DISTRO="jazzy")
     assert done == ["venv", "uv -e . --group test --group apt"]

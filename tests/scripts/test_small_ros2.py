@@ -58,7 +58,7 @@ def test_lists_executables(
         (["pkg", "executables", "zzz"], "known: needle_"),
     ],
 )
-def test_says_in_one_line_what_is_wrong(
+def test_errors_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     arguments: list[str],
@@ -72,7 +72,7 @@ def test_says_in_one_line_what_is_wrong(
 @pytest.mark.parametrize(
     ("arguments", "code"), [([], 0), (["--help"], 0), (["run", "needle_sim"], 2), (["bag"], 2)]
 )
-def test_says_what_it_knows(
+def test_help_refers_to_ros_2_for_everything_else(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     arguments: list[str],

@@ -1,4 +1,4 @@
-"""The training of the needle net: what it is shown, what it learns, and that it can be resumed."""
+"""Training of the needle net: its input, its progress, and its resumption."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_flat_image_is_level_and_an_edge_is_not() -> None:
-    # Running sums of such an image end a trifle below zero.
+    # Running sums of such an image end slightly below zero.
     for level in range(0, 256, 5):
         assert np.abs(normalized(np.full((120, 90), level, np.uint8))).max() < 0.01
     image = np.full((100, 100), 50, np.uint8)
@@ -84,7 +84,7 @@ def test_an_end_outside_the_patch_is_none(tmp_path: Path) -> None:
     assert np.isnan(batch.ends).all()
 
 
-def test_a_pool_takes_what_comes_and_forgets_what_goes(folder: Path, tmp_path: Path) -> None:
+def test_a_pool_adds_new_files_and_drops_removed_ones(folder: Path, tmp_path: Path) -> None:
     pool = Pool(tmp_path)
     assert pool.update() == 0
     for name in ("drawn-00000.npz", "traced-00000.npz"):
@@ -146,15 +146,13 @@ def test_a_net_that_diverges_ends_the_run_and_is_not_stored(folder: Path, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_run_is_resumed_exactly_and_opencv_reads_its_net(folder: Path, tmp_path: Path) -> None:
     torch, loop = torch_and_loop()
     pool = Pool(folder)
     paths = tmp_path / "needle_net.onnx", tmp_path / "checkpoint.pt"
     run = loop.new_run(3)
     with warnings.catch_warnings():
-        # The exporter says that another one is newer.
+        # The exporter warns of a newer version.
         warnings.simplefilter("ignore")
         loop.train(run, pool, loop.Plan(4, 5.0, *paths))
     other = loop.resumed(paths[1])
@@ -162,14 +160,14 @@ def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
     assert other.rng.bit_generator.state == run.rng.bit_generator.state
     for one, same in zip(run.net.parameters(), other.net.parameters(), strict=True):
         assert torch.equal(one, same)
-    # It goes on with samples of its own accord, and not beyond its end.
+    # It continues with its own samples, and not beyond its end.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         loop.train(other, Pool(folder), loop.Plan(6, 5.0, tmp_path / "other.onnx", paths[1]))
         loop.train(other, Pool(folder), loop.Plan(6, 5.0, tmp_path / "other.onnx", paths[1]))
     assert run.step == 4
     assert other.step == 6
-    # Any multiples of 4: the stored net is of no size.
+    # Any multiples of 4: the stored net has no fixed size.
     seen = np.random.default_rng(0).normal(0.0, 1.0, (1, 2, 100, 148)).astype(np.float32)
     with torch.no_grad():
         net = pytest.importorskip("training_net")
@@ -181,7 +179,7 @@ def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
     assert 0.0 < float(wanted[0].min()) < float(wanted[0].max()) < 1.0
 
 
-def test_a_net_from_stored_weights_sees_what_the_stored_one_sees(tmp_path: Path) -> None:
+def test_a_net_from_stored_weights_equals_the_stored_net(tmp_path: Path) -> None:
     torch, loop = torch_and_loop()
     net = pytest.importorskip("training_net")
     path = tmp_path / "needle_net.onnx"

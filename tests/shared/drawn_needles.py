@@ -18,7 +18,7 @@ def draw_line(
 
 
 def cover_line(coverage: np.ndarray, points: np.ndarray, width: float) -> None:
-    """Raise the coverage of pixels, 0 to 1, to that of a polyline, about its pieces only."""
+    """Raise the coverage of pixels, 0 to 1, to that of a polyline, only around its segments."""
     shape = coverage.shape
     last = len(points) - 2
     for i, (first, second) in enumerate(itertools.pairwise(points)):

@@ -1,4 +1,4 @@
-"""Shared by the bag tests: the bag of a made-up run whose figures are known."""
+"""Bag of a made-up run with known figures, shared by the bag tests."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def write_run(
     image_height: int | None = None,
     command: str | None = None,
 ) -> Path:
-    """A needle that goes from r1 = -3 mm to FINAL_R1 on a cosine, measured TIP_ERROR off."""
+    """Write a needle that moves from r1 = -3 mm to FINAL_R1 on a cosine, with errors TIP_ERROR."""
     out = SyntheticBag(directory, namespace)
     info = {"level": "tip", "controller": "paper", "seed": 7}
     if command is not None:
@@ -144,7 +144,7 @@ def write_run(
 
 @pytest.fixture
 def make_run(tmp_path: Path) -> Callable[..., Path]:
-    """Writes the made-up run into a bag; takes `write_run`'s keywords."""
+    """Return a function that writes the made-up run into a bag, with `write_run`'s keywords."""
 
     def make(name: str = "run", **how: Any) -> Path:
         return write_run(tmp_path / name, **how)

@@ -1,4 +1,4 @@
-"""Planted bugs: at least one for each invariant, and those that a schedule once found."""
+"""Planted bugs: at least one per invariant, and those found by a schedule."""
 
 from __future__ import annotations
 
@@ -243,4 +243,4 @@ _MENDED: dict[str, tuple[str, Plant]] = {
     ),
 }
 MENDED = {name: PlantedBug(*row, seed=0) for name, row in _MENDED.items()}
-"""By the schedule in tests/scenario/tests/schedules that found them, with its seed."""
+"""Bugs by the schedule in tests/scenario/tests/schedules that found them, with its seed."""

@@ -1,4 +1,4 @@
-"""Rigs that are known, by the simulation's own optics, and boards that are held before them."""
+"""Rigs with known parameters, by the simulation's optics, and boards in front of them."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ SMALL = CharucoBoard(5, 4, dictionary="DICT_4X4_50")
 SIZES = dict.fromkeys(SIDES, (1024, 768))
 NOISE_PX = 0.03
 GIVEN = (surface_from_above(0.0175, 1.33),) * 2
-"""What a session file says of the phantom that both cameras look through."""
+"""Phantom of a session file, through which both cameras look."""
 _WALL = (Layer(5e-3, 1.49),)
 GIVEN_BOX = (
-    # As a ruler and a data sheet tell it: faces to a millimetre, level and plumb.
+    # As measured by ruler and data sheet: faces to a millimetre, level and plumb.
     Window(np.array([0.0235, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), _WALL, 1.34),
     Window(np.array([0.0, 0.059, 0.0]), np.array([0.0, 1.0, 0.0]), _WALL, 1.34),
 )
 
 
 def session_content(**places: Any) -> dict[str, Any]:
-    """What a session file says."""
+    """Return the content of a session file."""
     phantom = {"surface_height": 0.0175, "refractive_index": 1.33}
     return {"board": dataclasses.asdict(BOARD), "phantom": phantom, "places": places}
 
 
 def lenses_of(calibration: StereoCalibration) -> StereoCalibration:
-    """Both cameras at the origin: lenses that are known, as nothing else is."""
+    """Return both cameras at the origin: only their lenses are known."""
     left, right = (
         dataclasses.replace(camera, T_optical_rig=np.eye(4))
         for camera in (calibration.left, calibration.right)
@@ -55,26 +55,26 @@ def lenses_of(calibration: StereoCalibration) -> StereoCalibration:
 
 
 def changed(rig: StereoRig, side: str, **values: Any) -> StereoRig:
-    """A rig with one camera changed."""
+    """Return a rig with one camera changed."""
     camera = dataclasses.replace(getattr(rig, side), **values)
     return dataclasses.replace(rig, **{side: camera})
 
 
 def turned(rig: StereoRig, side: str, degrees: float, axis: str = "y") -> StereoRig:
-    """A rig with one camera turned about an axis of its optical frame."""
+    """Return a rig with one camera turned about an axis of its optical frame."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     return changed(rig, side, T_optical_rig=turn @ getattr(rig, side).T_optical_rig)
 
 
 def with_window(rig: StereoRig, **values: Any) -> StereoRig:
-    """A rig whose surface is another one, for both cameras."""
+    """Return a rig with another surface for both cameras."""
     window = dataclasses.replace(rig.left.window, **values)
     return changed(changed(rig, "left", window=window), "right", window=window)
 
 
 def seen(camera: SimulatedCamera, points: Array, under: bool) -> Array:
-    """Pixels of points in rig; `under` says that they are seen through the window."""
+    """Return the pixels of points in rig; `under`: through the window."""
     if under:
         return project(points, camera)
     pose = camera.T_optical_rig
@@ -92,7 +92,7 @@ def view_of(
     noise: float = NOISE_PX,
     board: CharucoBoard = BOARD,
 ) -> BoardView:
-    """The board's corners inside both images, with noise."""
+    """Return the board's corners inside both images, with noise."""
     points, found = board.corners, []
     for camera in (rig.left, rig.right):
         moved = points @ pose[:3, :3].T + pose[:3, 3]
@@ -105,7 +105,7 @@ def view_of(
 
 
 def flat_pose(origin: Any, pitch_deg: float = 0.0) -> Array:
-    """T_rig_board of a board face up: columns along z, rows along y; then pitched in place."""
+    """Return T_rig_board of a board face up: columns along z, rows along y; then pitched."""
     pose = np.eye(4)
     flat = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     pose[:3, :3] = Rotation.from_euler("y", pitch_deg, degrees=True).as_matrix() @ flat
@@ -114,7 +114,7 @@ def flat_pose(origin: Any, pitch_deg: float = 0.0) -> Array:
 
 
 def held(turn: Rotation, up: Array, middle: Array, board: CharucoBoard = BOARD) -> Array:
-    """T_rig_board of a board with its print towards `up`, its columns along z, then turned."""
+    """Return T_rig_board of a board with its print towards `up`, columns along z, then turned."""
     pose = np.eye(4)
     z = np.array([0.0, 0.0, 1.0])
     pose[:3, :3] = turn.as_matrix() @ np.stack([z, np.cross(-up, z), -up], axis=-1)
@@ -137,7 +137,7 @@ def free_pose(
     tilts_deg: tuple[float, float] = (15, 42),
     board: CharucoBoard = BOARD,
 ) -> Array:
-    """A board held in the working volume, its middle seen by both cameras, tilted."""
+    """Return a tilted board pose in the working volume, with its centre in both views."""
     middle, up = rng.uniform([0.06, -0.012, 0.05], [0.10, 0.012, 0.075]), np.eye(3)[0]
     spin = rng.uniform(-25, 25) + 180 * rng.integers(2)
     return held(_tilt(up, tilts_deg, spin, rng), up, middle, board)
@@ -154,12 +154,12 @@ PLACES = {
 _DIAGONAL = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
 _MIDDLE = np.array([0.0, 0.0, 0.0625])
 STANDS = Place(held(Rotation.identity(), _DIAGONAL, _MIDDLE, BOX_BOARD), under_surface=True)
-"""Where the board stands in the box: half-way between both views, about the needle's axis."""
+"""Place of the board in the box: half-way between both views, about the needle's axis."""
 IN_BOX = Place(np.eye(4), under_surface=True, sigma=np.inf)
 
 
 def scatter(place: Place, rng: np.random.Generator) -> Array:
-    """A place as it really is: known to its sigma only."""
+    """Return the true pose of a place, which is known only to its sigma."""
     pose: Array = place.T_rig_board.copy()
     turn = Rotation.from_rotvec(rng.normal(0.0, 2 * place.sigma / 0.12, 3))
     pose[:3, :3] = turn.as_matrix() @ pose[:3, :3]
@@ -175,7 +175,7 @@ def take(
     noise: float = NOISE_PX,
     board: CharucoBoard = BOARD,
 ) -> list[BoardView]:
-    """Views of a calibration session; places are those the session file says."""
+    """Return the views of a calibration session; `places` are those of the session file."""
     rng = np.random.default_rng(seed)
     poses: list[tuple[str, Array, Place | None]] = [
         (f"free_{i:02d}", free_pose(rng, board=board), None) for i in range(free)
@@ -187,7 +187,7 @@ def take(
 def take_in_box(
     rig: StereoRig, air: int = 12, box: int = 3, seed: int = 0, noise: float = NOISE_PX
 ) -> list[BoardView]:
-    """Boards before the windows in turn, one that stands in the box, and some held in it."""
+    """Return boards in front of the windows in turn, one standing in the box, some held in it."""
     rng = np.random.default_rng(seed)
     poses: list[tuple[str, Array, Place | None]] = []
     for i in range(air):
@@ -206,5 +206,5 @@ def take_in_box(
 
 
 def board_image(board: CharucoBoard, square_px: int, margin: int = 0) -> NDArray[np.uint8]:
-    """The pattern with a white margin."""
+    """Return the pattern with a white margin."""
     return np.pad(board.drawing(square_px), margin, constant_values=255)

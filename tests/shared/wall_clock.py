@@ -1,4 +1,4 @@
-"""A wall clock of a test's own: it goes on while somebody waits or computes."""
+"""Simulated wall clock: it advances while a component waits or computes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 
 class WallClock:
-    """Clock and bell of a `PacedRunner`, and what happens outside meanwhile."""
+    """Clock and bell of a `PacedRunner`, and scheduled external events."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -20,11 +20,11 @@ class WallClock:
         return self.now
 
     def at(self, when: float, happen: Callable[[], None]) -> None:
-        """Let something happen at a time [s]."""
+        """Schedule an event at a time [s]."""
         heapq.heappush(self._planned, (when, next(self._number), happen))
 
     def every(self, period: float, happen: Callable[[], None]) -> None:
-        """Let something happen again and again."""
+        """Schedule a periodic event."""
 
         def again() -> None:
             happen()
@@ -33,7 +33,7 @@ class WallClock:
         self.at(self.now + period, again)
 
     def spend(self, seconds: float, *, until_rung: bool = False) -> None:
-        """Let time go by."""
+        """Advance time."""
         end = self.now + seconds
         while self._planned and self._planned[0][0] <= end:
             if until_rung and self._rung:

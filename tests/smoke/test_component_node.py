@@ -235,7 +235,7 @@ def bench() -> Iterator[Bench]:
         bench.close()
 
 
-def test_bad_bytes_long_ones_and_a_failing_handler_are_named_and_end_nothing(bench: Bench) -> None:
+def test_bad_or_long_data_and_a_failing_handler_are_reported_and_end_nothing(bench: Bench) -> None:
     def health(part: str) -> str:
         return bench.health.get(f"echo: {part}", "")
 
@@ -285,7 +285,7 @@ def test_latched_messages_lazy_inputs_and_peers_and_a_qos_that_does_not_fit(benc
     bench.until(lambda: "--qos-durability transient_local" in bench.health.get("echo: input", ""))
 
 
-def test_parameters_are_taken_whole_typed_and_within_bounds_or_not_at_all(bench: Bench) -> None:
+def test_parameters_are_applied_together_typed_and_within_bounds_or_rejected(bench: Bench) -> None:
     def message(value: Any) -> ParameterMessage:
         return Parameter("gain", value=value).to_parameter_msg()
 

@@ -111,7 +111,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
             browser.close()
 
 
-def test_mouse_space_bar_and_finger_hold_until_they_are_let_go(scene: Scene) -> None:
+def test_mouse_space_bar_and_finger_hold_until_released(scene: Scene) -> None:
     tab = scene.tab
     scene.ends(scene.hold_pointer, lambda: tab.release_pointer(*BUTTON))
     scene.ends(scene.hold_space, tab.release_space)
@@ -127,12 +127,12 @@ def test_a_second_finger_or_button_or_key_ends_a_hold(scene: Scene) -> None:
     scene.ends(scene.hold_space, lambda: tab.press_key("Escape"))
 
 
-def test_a_button_or_page_that_goes_ends_its_hold(scene: Scene) -> None:
+def test_a_removed_button_or_page_ends_its_hold(scene: Scene) -> None:
     anew = "for (const old of document.querySelectorAll('button')) old.outerHTML = old.outerHTML"
     scene.ends(scene.hold_pointer, lambda: scene.tab.run(anew))
-    # What takes its place is a button like it.
+    # Its replacement is an identical button.
     scene.ends(scene.hold_pointer, lambda: scene.tab.release_pointer(*BUTTON))
-    # A page that is hidden, and one that is closed.
+    # A hidden page, and a closed one.
     browser, url = scene.browser, scene.tab.run("location.href")
     scene.ends(scene.hold_pointer, lambda: browser.open("about:blank"))
     browser.close_all_but(scene.tab)
@@ -144,7 +144,7 @@ def test_a_button_or_page_that_goes_ends_its_hold(scene: Scene) -> None:
     scene.tab.release_space()
 
 
-def test_the_page_says_why_a_hold_ended_by_itself(scene: Scene) -> None:
+def test_the_page_gives_the_reason_of_an_ended_hold(scene: Scene) -> None:
     tab = scene.tab
 
     def why() -> str:
@@ -169,14 +169,14 @@ def test_the_page_says_why_a_hold_ended_by_itself(scene: Scene) -> None:
     stalled = "hold ended: no echo from this page for 0.25 s (browser, network or console stalled)"
     scene.until(lambda: why() == stalled, "it says why")
     assert tab.run(_STATE) == "again"
-    # It goes with the next press.
+    # It disappears with the next press.
     scene.hold_pointer()
     assert why() == ""
     tab.release_pointer(*BUTTON)
     scene.until_released()
 
 
-def test_what_is_no_press_does_not_hold(scene: Scene) -> None:
+def test_other_events_than_a_press_do_not_hold(scene: Scene) -> None:
     tab = scene.tab
     tab.release_space()
     assert scene.never_pressed(lambda: tab.press_space(repeat=True))

@@ -63,7 +63,9 @@ def awaited(condition: Callable[[], bool]) -> bool:
     return condition()
 
 
-def test_every_node_starts_is_heard_and_ends_on_sigterm(tmp_path: Path, listener: Node) -> None:
+def test_every_node_starts_is_discovered_and_ends_on_sigterm(
+    tmp_path: Path, listener: Node
+) -> None:
     for side in SIDES:
         (tmp_path / side).mkdir()
         cv2.imwrite(str(tmp_path / side / "1.png"), np.zeros((768, 1024), np.uint8))

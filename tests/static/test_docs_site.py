@@ -1,4 +1,4 @@
-"""The documents' site: no warning (of a dead link, too), nothing loaded from the network."""
+"""The documentation site: no warnings (such as dead links), nothing loaded from the network."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from code_lines import ROOT
 from docs_site.navigation import listed, navigation, parts
 
-# A link, script or image that a page loads by itself from another host.
+# A link, script or image that a page loads from another host.
 ELSEWHERE = re.compile(r'<(?:link|script|img)\b[^>]*\b(?:href|src)="((?:https?:)?//[^"]*)"')
 
 
@@ -40,7 +40,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
+def test_nothing_is_loaded_from_other_hosts(site: Path) -> None:
     pages = [path.read_text("utf-8") for path in site.rglob("*.html")]
     assert len(pages) > 60
     assert [link for page in pages for link in ELSEWHERE.findall(page)] == []

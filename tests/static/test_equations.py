@@ -72,7 +72,7 @@ def module_of(name: str) -> str:
     raise AssertionError(name)
 
 
-def test_citations_are_told_from_other_brackets() -> None:
+def test_citations_are_distinguished_from_other_brackets() -> None:
     text = "On SE(3), IEEE 25(1), shape (3,): (6)-(8) and [KC09] (2), the inverse of (10)"
     assert cited(text) == {2, 6, 7, 8, 10}
 

@@ -38,7 +38,7 @@ def test_style(how: tuple[str, ...]) -> None:
 
 
 # One package at a time: every package has a test folder, with files of the same name in several.
-# The first has the libraries' types to read; on a busy machine that takes minutes.
+# The first must read the types of the libraries, which takes minutes on a busy machine.
 @on_typed_numpy
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
 def test_types_of_a_package(package: Path) -> None:

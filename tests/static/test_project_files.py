@@ -36,7 +36,7 @@ def commands(workflow: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize("name", [*(path.name for path in WORKFLOWS), "tests.md"])
-def test_a_workflow_runs_what_there_is(name: str) -> None:
+def test_a_workflow_runs_existing_files(name: str) -> None:
     text = commands(workflows()[name])
     scripts = set(SCRIPT.findall(text))
     assert scripts
@@ -59,7 +59,7 @@ def test_executables_and_launch_files_of_workflows_are_there() -> None:
         assert f"\n{name} = " in (source / package / package / "executables.py").read_text("utf-8")
 
 
-def test_an_image_is_built_of_stages_that_its_file_has() -> None:
+def test_an_image_is_built_from_existing_stages() -> None:
     container = json.loads((ROOT / ".devcontainer/devcontainer.json").read_text("utf-8"))
     build = container["build"]
     file = (ROOT / ".devcontainer" / build["dockerfile"]).resolve()
@@ -79,7 +79,7 @@ def test_an_image_gets_nothing_that_git_ignores() -> None:
     assert made <= lines(".gitignore")
 
 
-def test_one_version_everywhere() -> None:
+def test_all_files_have_one_version() -> None:
     versions = {
         manifest.parent.name: ElementTree.parse(manifest).findtext("version")
         for manifest in sorted(ROOT.glob("ros2_ws/src/*/package.xml"))
@@ -93,7 +93,7 @@ def test_one_version_everywhere() -> None:
     assert set(versions.values()) == {newest}, versions
 
 
-def test_a_citation_has_what_the_format_wants() -> None:
+def test_a_citation_has_the_required_fields() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
     assert {"cff-version", "title", "message", "authors"} <= set(citation)
     assert citation["license"] == "Apache-2.0"

@@ -32,7 +32,7 @@ def runtime_modules() -> Iterator[tuple[str, ast.Module]]:
             yield str(path.relative_to(SOURCES / package)), ast.parse(path.read_text("utf-8"))
 
 
-def test_what_a_real_run_recorded_is_there_with_its_type(nodes: list[RigNode]) -> None:
+def test_recorded_topics_are_in_the_reference_with_their_types(nodes: list[RigNode]) -> None:
     page = topics_page(nodes)
     text = (ROOT / "bags/regression/metadata.yaml").read_text("utf-8")
     recorded = yaml.safe_load(text)["rosbag2_bagfile_information"]["topics_with_message_count"]
@@ -64,7 +64,7 @@ def test_every_declared_parameter_is_that_of_a_node(nodes: list[RigNode]) -> Non
     assert declared - fields == set()
 
 
-def test_every_part_and_complaint_of_diagnostics_is_there(nodes: list[RigNode]) -> None:
+def test_every_part_and_message_of_diagnostics_is_listed(nodes: list[RigNode]) -> None:
     parts = {part for node in nodes for part in node.parts} | set(IN_EVERY_NODE)
     for path, tree in runtime_modules():
         for call in ast.walk(tree):
@@ -83,7 +83,7 @@ def test_every_part_and_complaint_of_diagnostics_is_there(nodes: list[RigNode]) 
     assert words - compared <= len(found) <= words
 
 
-def test_every_command_line_is_there(nodes: list[RigNode]) -> None:
+def test_every_command_line_is_listed(nodes: list[RigNode]) -> None:
     page = commands_page(nodes)
     commands = [name for _, name, _ in executables("command")]
     assert {node.name for node in nodes} == {name for _, name, _ in executables("node")}
@@ -93,7 +93,7 @@ def test_every_command_line_is_there(nodes: list[RigNode]) -> None:
         assert "usage: " in text.partition("\n###")[0], name
 
 
-def test_the_picture_of_the_graph_is_as_the_nodes_are(nodes: list[RigNode]) -> None:
+def test_the_diagram_of_the_graph_matches_the_nodes(nodes: list[RigNode]) -> None:
     picture = ElementTree.parse(ROOT / "docs/images/graph.svg")
     by_name = {node.name: node for node in nodes}
     arrows = [part.attrib for part in picture.iter() if "data-topics" in part.attrib]

@@ -40,7 +40,7 @@ def test_a_line_of_code_is_no_blank_comment_or_docstring() -> None:
     assert code_lines(SOURCE) == 2 + 1 + 3 + 1
 
 
-def test_no_module_is_too_long_to_be_read_at_once() -> None:
+def test_no_module_is_too_long() -> None:
     long = {
         str(module.relative_to(ROOT)): length
         for module in modules(ROOT)
@@ -49,7 +49,7 @@ def test_no_module_is_too_long_to_be_read_at_once() -> None:
     assert not long
 
 
-def test_no_folder_holds_too_many_modules_to_be_found_in() -> None:
+def test_no_folder_has_too_many_modules() -> None:
     folders = Counter(module.parent for module in modules(ROOT) if module.name != "__init__.py")
     full = {
         str(folder.relative_to(ROOT)): number
@@ -71,7 +71,7 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
     assert clauses == []
 
 
-def test_no_node_is_rclpys_own() -> None:
+def test_no_node_derives_from_rclpy_directly() -> None:
     # Its own base class destroys a node whose construction fails.
     found = []
     for path in sorted((ROOT / "ros2_ws" / "src").glob("*/*/ros/*.py")):

@@ -1,4 +1,4 @@
-"""The console's page in a real browser, on a simulated rig: seen, steered, stopped."""
+"""The console's page in a real browser, on a simulated rig: display, steering, stop."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def address() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """Return a browser of its own."""
+    """Return a separate browser."""
     with sync_playwright() as playwright:
         context = playwright.chromium.launch_persistent_context(
             str(tmp_path_factory.mktemp("profile")),
@@ -214,7 +214,7 @@ def test_another_page_sees_and_can_stop_but_not_move(
     page.mouse.up()
 
 
-def test_a_target_is_changed_in_the_middle_and_nonsense_is_refused(page: Page) -> None:
+def test_a_target_is_changed_while_steering_and_invalid_input_is_rejected(page: Page) -> None:
     press(page, "Set point")
     expect(reading(page, "Reach")).to_contain_text("point")
     offset = page.get_by_label("Plane offset [mm]")
@@ -226,7 +226,7 @@ def test_a_target_is_changed_in_the_middle_and_nonsense_is_refused(page: Page) -
     expect(reading(page, "Reach")).to_contain_text("plane")
 
 
-def test_the_needle_is_drawn_out_by_a_hold_too(page: Page) -> None:
+def test_the_needle_is_withdrawn_by_a_hold(page: Page) -> None:
     page.locator("[data-hold=retract]").hover()
     hold_until(page, page.mouse.down, page.mouse.up, "< 1")
     page.mouse.up()

@@ -26,7 +26,7 @@ with subprocess.Popen(
 """
 
 
-def test_what_a_node_started_ends_with_it(tmp_path: Path) -> None:
+def test_children_of_a_node_end_with_it(tmp_path: Path) -> None:
     code = """
 import subprocess, sys
 print(subprocess.Popen(["sleep", "1000"]).pid, flush=True)
@@ -60,7 +60,7 @@ time.sleep(1000)
     assert_ends(child)
 
 
-def test_none_is_left_after_an_interrupt() -> None:
+def test_no_process_is_left_after_an_interrupt() -> None:
     mark = {"NEEDLE_TEST_MARK": "descendants"}
     with pytest.raises(KeyboardInterrupt), ending_descendants():
         process = subprocess.Popen(

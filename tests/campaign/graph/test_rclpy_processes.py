@@ -24,7 +24,7 @@ from needle_core.process.worker import start_worker
 from needle_core.settings.parameter_files import values_for
 
 
-def test_a_node_begins_where_the_maker_of_a_port_ended_half_way() -> None:
+def test_a_node_starts_after_a_port_was_left_incomplete() -> None:
     code = """
 import sys
 from rclpy.node import Node
@@ -95,7 +95,7 @@ sys.exit(run_node(node, help_text="", parameters=object, args=["hears"], spin=sp
 """
 
 
-def test_a_node_goes_when_what_it_said_has_reached_a_subscriber_that_stood_still() -> None:
+def test_a_node_exits_after_a_stalled_subscriber_has_its_messages() -> None:
     with reserve_domain_id() as domain, contextlib.ExitStack() as ends:
 
         def start(code: str) -> subprocess.Popen[bytes]:
@@ -137,7 +137,7 @@ sys.stdin.read()
 """
 
 
-def test_a_kill_frees_the_name_that_a_process_has() -> None:
+def test_a_kill_releases_the_name_of_a_process() -> None:
     name = f"/device/status {uuid.uuid4()}"
     with subprocess.Popen(
         [sys.executable, "-c", CLAIMS, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -166,7 +166,7 @@ class Desk:
 
 
 @pytest.mark.parametrize("number", ENDING_SIGNALS)
-def test_a_signal_ends_no_worker_and_stays_one_for_its_parent(number: signal.Signals) -> None:
+def test_a_signal_ends_no_worker_and_is_not_blocked_in_the_parent(number: signal.Signals) -> None:
     with start_worker(Desk.put, "images") as worker:
         process, there = worker.submit(Desk.tell).result()
         assert there == "images"
@@ -193,7 +193,7 @@ NAMES = (
 
 
 @pytest.mark.parametrize("node", REMAPPINGS)
-def test_the_same_sections_reach_a_node_as_rcl_gives_it(tmp_path: Path, node: str) -> None:
+def test_a_node_gets_the_same_sections_as_from_rcl(tmp_path: Path, node: str) -> None:
     sections = {name: {f"p{i}": i, "last": i} for i, name in enumerate(NAMES)}
     file = tmp_path / "p.yaml"
     file.write_text("".join(f"'{n}': {{ros__parameters: {v}}}\n" for n, v in sections.items()))

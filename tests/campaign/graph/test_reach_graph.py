@@ -121,13 +121,13 @@ def test_a_node_listens_to_this_machine_only_unless_asked_otherwise(
 
 
 @pytest.mark.parametrize("node", NODES)
-def test_who_must_not_be_held_up_has_no_shared_memory(start: Start, node: str) -> None:
+def test_nodes_that_must_not_block_use_no_shared_memory(start: Start, node: str) -> None:
     asked = OPEN if node == "device_driver" else {DISCOVERY_RANGE: "LOCALHOST"}
     process = start("rig", node=node, **asked)
     assert "/dev/shm/fastrtps" not in Path(f"/proc/{process.pid}/maps").read_text("utf-8")
 
 
-def test_from_another_network_nothing_is_seen_and_nothing_is_moved(
+def test_another_computer_neither_discovers_nor_stops_a_closed_rig(
     start: Start, domain: int
 ) -> None:
     with two_computers() as (rig, other, _):

@@ -43,20 +43,20 @@ class Row:
     within : float
         Share that ends within 1 mm of the plane.
     rms_mm : float
-        Over the last 20 mm.
+        RMS distance from the plane over the last 20 mm [mm].
     inside : float, optional
-        Share of x over the last 20 mm within 3 standard deviations; None from one that states none,
-        and so the next three.
+        Share of x over the last 20 mm within 3 standard deviations; None if the estimator states
+        none, which also holds for the next three.
     misses : int
         Needles that end farther than 1 mm off.
     called : float, optional
-        Share of the misses that were called doubtful.
+        Share of the misses that were reported as doubtful.
     false_alarms : float, optional
-        Share of the others that were.
+        Share of the other needles that were reported as doubtful.
     bins : list of tuple
-        See `Bins`; empty likewise.
+        See `Bins`; empty if no probabilities are stated.
     rotation_deg : float
-        Mean of what the base turns.
+        Mean rotation of the base [deg].
     cpu_s : float
         Processor time of all needles.
     """
@@ -128,7 +128,7 @@ def _bins(stated: Any, missed: Any) -> Bins:
 
 
 def together(rows: Sequence[Row]) -> Bins:
-    """Return the bins of some rows as one."""
+    """Return the sum of the bins of some rows."""
     said = [row.bins for row in rows if row.bins]
     return [
         (sum(n for n, _, _ in same), sum(p for _, p, _ in same), sum(m for _, _, m in same))
@@ -144,7 +144,7 @@ def markdown(table: Table, estimators: Sequence[str]) -> str:
     table : dict
         Figures by trouble and estimator; an estimator may lack a trouble.
     estimators : sequence of str
-        In the order in which each cell has them.
+        Order of the estimators in each cell.
     """
     states = [
         name

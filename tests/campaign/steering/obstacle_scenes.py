@@ -30,9 +30,9 @@ class ObstacleScene:
     Attributes
     ----------
     target : ndarray, shape (3,)
-        In `rig` [m].
+        Position in `rig` [m].
     obstacles : ndarray, shape (N, 7)
-        Ends of the axis and radius of each capsule [m]; a sphere's ends are one.
+        Ends of the axis and radius of each capsule [m]; the ends of a sphere are equal.
     pitch, roll : float
         Orientation at the entry, unknown to the controller [rad].
     """
@@ -51,11 +51,11 @@ def make_scene(
     Parameters
     ----------
     seed, number : int
-        Key of its randomness.
+        Keys of the random numbers.
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
     pitch_bound, roll_bound : float
-        Of the needle at the entry: uniform within +- these [rad].
+        Bounds of the uniform pitch and roll at the entry [rad].
     """
     rng = np.random.default_rng([seed, number])
     length = rng.uniform(NEAREST, FARTHEST)
@@ -79,14 +79,14 @@ def make_scene(
 
 
 def clearance(obstacles: FloatArray, point: FloatArray) -> float:
-    """Return a point's distance from the nearest surface, < 0 inside [m].
+    """Return a point's distance from the nearest surface [m], negative inside.
 
     Parameters
     ----------
     obstacles : ndarray, shape (N, 7)
         See `ObstacleScene`.
     point : ndarray, shape (3,)
-        In `rig` [m].
+        Position in `rig` [m].
     """
     if not len(obstacles):
         return math.inf

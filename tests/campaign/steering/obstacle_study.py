@@ -71,7 +71,7 @@ class SceneOutcome:
 
 
 def solvability(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
-    """Return whether a scene has a path, as the outcome of a needle that was not started."""
+    """Return whether a scene has a path, as the outcome of a needle that did not start."""
     bare, solvable = (
         find_path(
             scene.target,
@@ -95,18 +95,18 @@ def steer(
     rng: np.random.Generator,
     times: list[float],
 ) -> SceneOutcome:
-    """Steer a needle through a scene as the node does; return how it ended.
+    """Steer a needle through a scene as the node does; return the outcome.
 
     Parameters
     ----------
     scene, solved : ObstacleScene, SceneOutcome
-        The scene, and what is known of it.
+        The scene, and its solvability.
     settings : SteeringSettings
-        The controller's; its `tip_noise_bound` is the largest error of a measured coordinate, too.
+        Settings of the controller; `tip_noise_bound` is also the largest error of a coordinate.
     rng : numpy.random.Generator
-        Of the tips' noise.
+        Generator of the tips' noise.
     times : list of float
-        What each update takes of the processor is added here [s].
+        List to which the CPU time of each update is appended [s].
     """
     drive = _start_controller(scene, settings)
     if drive is None:
@@ -134,7 +134,7 @@ def steer(
 
 
 def _start_controller(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
-    """Return what steers a needle as the node does, None where that refuses to start."""
+    """Return a function that steers a needle as the node does; None if the node would not start."""
     obstacles = tuple(float(value) for value in scene.obstacles.ravel())
     control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
     control.target_point = scene.target
@@ -162,13 +162,13 @@ def study(
     Parameters
     ----------
     scenes, seed : int
-        How many, and the key of all randomness.
+        Number of scenes, and seed of all random numbers.
     pitch_bound, roll_bound : float
-        Of the needles at their entries [rad].
+        Bounds of the needles' angles at their entries [rad].
     entry_angle_std : float
-        What the controller is told of that [rad].
+        Standard deviation of these angles that the controller assumes [rad].
     noise : float
-        Largest error of a measured coordinate, as it is told [m].
+        Largest error of a measured coordinate, which the controller assumes, too [m].
     """
     settings = SteeringSettings(
         depth=DEPTH,
@@ -190,7 +190,7 @@ def study(
 
 
 def figures(outcomes: Sequence[SceneOutcome], times: Sequence[float]) -> dict[str, float | None]:
-    """Return the figures of some outcomes, by the names of `LABELS`; shares where they are of."""
+    """Return the figures of some outcomes, by the names of `LABELS`, as shares where possible."""
 
     def share(of: Sequence[SceneOutcome], what: Callable[[SceneOutcome], bool]) -> float | None:
         return sum(what(one) for one in of) / len(of) if of else None

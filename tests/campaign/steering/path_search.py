@@ -1,12 +1,12 @@
 """Thorough search for a path through a scene, independent of the planner.
 
-A tree of needles that are driven in steps of 1 mm, the bevel turned at its greatest rate towards a
-random point, each from the nearest needle that has it within reach and for a random length; from
-every needle the target is driven to. With thousands of points it misses few ways that there are
-(probabilistically complete: LaValle and Kuffner 2001); what it finds is a way for certain.
+A tree of needles grows in steps of 1 mm: from the nearest needle that can reach a random point, a
+new one is driven towards it for a random length, the bevel turned at its greatest rate; each new
+needle is also driven to the target. With thousands of points it misses few existing paths
+(probabilistically complete: LaValle and Kuffner 2001); a path that it finds certainly exists.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Compiled code accepts keywords slowly or not at all.
 from __future__ import annotations
 
 import math
@@ -40,17 +40,17 @@ def find_path(
     target : ndarray, shape (3,)
         In `rig`; the needle enters at its origin along z and bends to -y [m].
     obstacles : ndarray, shape (N, 7)
-        Ends of the axis and radius of each [m].
+        Ends of the axis and radius of each capsule [m].
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
     turn_rate : float
-        Most that the bevel turns per inserted length [rad/m].
+        Largest turn of the bevel per inserted length [rad/m].
     clear : float
         Least distance from every obstacle [m].
     samples : int
-        Most points that are tried.
+        Largest number of random points.
     seed : int
-        Of the points.
+        Seed of the points.
     """
     np.random.seed(seed)  # noqa: NPY002 - compiled code has no other
     # Position, heading, and direction of the bend.

@@ -24,7 +24,7 @@ from needle_core.commands.cli import EXIT_DONE, run_command
 from needle_core.errors import UserError
 
 SEEN, AHEAD = 0.050, 0.098
-"""Depth up to which tips are seen, and that of the forecast [m]."""
+"""Largest depth of the given tips, and depth of the forecast [m]."""
 _NEAR = 0.004
 _COLUMNS = ("Tip x", "Tip y", "Tip z", "Tip sec", "Tip nanosec")
 
@@ -35,7 +35,7 @@ def tips_of(path: Path) -> Array:
     Raises
     ------
     UserError
-        If it has no such columns.
+        If the file lacks these columns.
     """
     with path.open(encoding="utf-8", newline="") as stream:
         rows = [
@@ -43,7 +43,7 @@ def tips_of(path: Path) -> Array:
         ]
     if not rows or not set(_COLUMNS) <= rows[0].keys():
         raise UserError(f"{path}: expected columns {', '.join(_COLUMNS)}")
-    # A tip that was not measured anew comes again, and as zeros before the first.
+    # A repeated row was not measured anew; zeros precede the first measurement.
     values = dict.fromkeys(tuple(float(row[name]) for name in _COLUMNS) for row in rows)
     x, y, z = np.array([value[:3] for value in values if any(value[:2])]).T * 1e-3
     inside = y <= 0.0
@@ -52,7 +52,7 @@ def tips_of(path: Path) -> Array:
 
 
 def place_at(tips: Array, depth: float) -> Array | None:
-    """Return where a path is at a depth, (2,) [m], by a line through its tips nearby, or None."""
+    """Return the position at a depth, (2,) [m], by a line through the nearby tips, or None."""
     near = np.abs(tips[:, 2] - depth) < _NEAR
     if np.sum(near) < 3 or np.max(tips[:, 2]) < depth - 0.0015:
         return None
@@ -61,14 +61,14 @@ def place_at(tips: Array, depth: float) -> Array | None:
 
 
 def compare(tips: Array, truth: Array) -> tuple[float, float, bool]:
-    """Return what forecast and plain parabola are off [m], and whether x and y are in the interval.
+    """Return the errors of forecast and parabola [m], and whether x and y are in the interval.
 
     Parameters
     ----------
     tips : ndarray, shape (K, 3)
         See `tips_of`.
     truth : ndarray, shape (2,)
-        At the depth of the forecast [m].
+        Position at the depth of the forecast [m].
     """
     seen = tips[tips[:, 2] <= SEEN]
     checked = fit_checked(seen, None, CurvatureFitSettings(repeating_error=2e-5))

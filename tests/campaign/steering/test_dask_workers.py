@@ -1,4 +1,4 @@
-"""Studies on a real scheduler and real workers, each a process: the same bits, whoever dies."""
+"""Studies on a real scheduler and real worker processes: the same bits, even if workers die."""
 
 from __future__ import annotations
 
@@ -58,6 +58,6 @@ def test_a_killed_worker_costs_only_time(two_workers: Cluster, tmp_path: Path) -
 
 
 @NEEDED
-def test_a_part_that_ends_every_worker_is_given_up(two_workers: Cluster) -> None:
+def test_a_part_that_kills_every_worker_is_abandoned(two_workers: Cluster) -> None:
     with pytest.raises(UserError, match=r"workers died while running it.*out of memory"):
         list(on_cluster(two_workers.address, end_every, [None]))

@@ -22,14 +22,14 @@ ROW = Row(0.999, 0.15, 0.99, 1, 1.0, 0.02, [(100, 0.5, 1)] * (len(EDGES) - 1), 1
 SILENT = dataclasses.replace(ROW, inside=None, called=None, false_alarms=None, bins=[])
 
 
-def test_every_row_of_the_step_is_there() -> None:
+def test_the_table_has_every_row_of_the_step() -> None:
     assert {"best", "push_2", "gain_80", "roll_walk_5", "camera", "layer", "found_30"} <= {
         *COMPARED
     }
     assert len(COMPARED) == 25
 
 
-def test_figures_are_shares_of_what_they_are_of() -> None:
+def test_figures_are_shares_of_the_counted_needles() -> None:
     x = np.array([0.0, 0.002, -0.002, 0.0005])
     nothing, of_each = np.zeros(4), np.ones(4)
     outcomes = Outcomes(
@@ -50,7 +50,7 @@ def test_figures_are_shares_of_what_they_are_of() -> None:
     assert row.bins[-1] == (1, 1.0, 1)
 
 
-def test_the_table_has_a_dash_for_what_is_not_said() -> None:
+def test_missing_values_are_dashes_in_the_table() -> None:
     text = markdown(
         {"push": {"best": ROW, "paper": SILENT}, "flips": {"best": ROW}}, ["best", "paper"]
     )
@@ -61,7 +61,7 @@ def test_the_table_has_a_dash_for_what_is_not_said() -> None:
 
 
 @pytest.mark.parametrize("key", ["best", "push_2", "late", "flips"])
-def test_the_filter_that_all_is_compared_to_steers_and_knows_where_it_is(key: str) -> None:
+def test_the_reference_filter_steers_and_its_estimate_is_accurate(key: str) -> None:
     row = steer(COMPARED[key], "ekf", 1000)
     assert row.within > 0.94
     assert row.inside is not None

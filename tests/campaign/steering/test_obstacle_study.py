@@ -26,7 +26,7 @@ WALL = np.array([[-0.05, y, 0.04, 0.05, y, 0.04, 0.006] for y in np.arange(-0.05
 WALLED = dataclasses.replace(FREE, obstacles=WALL)
 
 
-def test_a_scene_is_what_its_key_says_and_lies_within_its_bounds() -> None:
+def test_a_scene_follows_its_key_and_bounds() -> None:
     bounds = {"curvature": CURVATURE, "pitch_bound": 0.02, "roll_bound": 0.2}
     for n in range(30):
         scene, again = (make_scene(4, n, **bounds) for _ in range(2))
@@ -40,7 +40,7 @@ def test_a_scene_is_what_its_key_says_and_lies_within_its_bounds() -> None:
         assert abs(scene.roll) <= 0.2
 
 
-def test_the_judge_finds_a_way_where_there_is_one_and_none_through_a_wall() -> None:
+def test_the_search_finds_an_existing_path_and_none_through_a_wall() -> None:
     assert solvability(FREE, SETTINGS) == SceneOutcome(True, True)
     assert solvability(WALLED, SETTINGS) == SceneOutcome(False, False)
     # Farther to the side than the needle bends, by a millimetre: (1 - cos) of an arc of 122 mm.

@@ -17,7 +17,7 @@ def write(path: Path, depth: float) -> Path:
     x, z = -0.025 + y**2 / (2.0 * RADIUS), 0.020 + 0.0 * y
     lines = ["Robot x,Tip x, Tip y, Tip z,Tip sec,Tip nanosec", "0,0,0,0,0,0"]
     for n, (a, b, c) in enumerate(1e3 * np.stack([x, y, z], axis=-1)):
-        # The same tip is written down twice.
+        # The same tip is recorded twice.
         lines += [f"0,{a},{b},{c},5,{n}"] * 2
     path.write_text("\n".join(lines), encoding="utf-8")
     return path
@@ -36,7 +36,7 @@ def test_a_file_is_read_from_the_entry_on_and_forecast(tmp_path: Path) -> None:
     assert inside
 
 
-def test_what_is_too_short_or_of_another_kind_is_left_out(tmp_path: Path) -> None:
+def test_short_or_unsuitable_files_are_left_out(tmp_path: Path) -> None:
     assert place_at(tips_of(write(tmp_path / "exp.csv", 0.09)), 0.098) is None
     (tmp_path / "other.csv").write_text("a,b\n1,2\n", encoding="utf-8")
     with pytest.raises(UserError, match="wants columns"):

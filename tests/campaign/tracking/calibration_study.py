@@ -1,4 +1,4 @@
-"""Errors of tips after a rig that is known was calibrated from a board's noisy corners."""
+"""Errors of tips measured with a calibration from a board's noisy corners."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FREE = 20
 
 
 def calibrated_tip_errors(calibration: Path, seed: int, corner_sigma: float) -> NDArray[np.float64]:
-    """Return how far tips are off that a calibration from noisy corners measures without noise.
+    """Return the errors of noise-free tips with a calibration from noisy corners.
 
     The set is the one that `docs/calibration.md` asks for. The corners come from the simulation's
     own projection.
@@ -27,16 +27,16 @@ def calibrated_tip_errors(calibration: Path, seed: int, corner_sigma: float) -> 
     Parameters
     ----------
     calibration : Path
-        The rig as it is.
+        Calibration file of the true rig.
     seed : int
-        Of the corners' noise, the poses held by hand and the places' errors.
+        Seed of the corner noise, the hand-held poses and the errors of the places.
     corner_sigma : float
         Standard deviation of each coordinate of a corner [px].
 
     Returns
     -------
     ndarray, shape (n,)
-        Distances [m] at points all over where the needle goes.
+        Distances [m] at points throughout the needle's workspace.
     """
     rig = load_stereo_rig(calibration)
     views = take(rig, seed, _FREE, noise=corner_sigma, board=CharucoBoard())

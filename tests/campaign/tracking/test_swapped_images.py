@@ -1,4 +1,4 @@
-"""Swapped images are suspected, and nothing else is: needles rendered in all scenes."""
+"""Swapped images are suspected, correct ones are not: needles rendered in all scenes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Pair = tuple[float, np.ndarray, np.ndarray]
 
 @functools.lru_cache(maxsize=1)
 def pairs(path: Path, scenario: str, seed: int, last_mm: int = 40) -> list[Pair]:
-    """Draw what the cameras see; tests of one scenario follow each other."""
+    """Render image pairs; cached, because tests of one scenario follow each other."""
     return list(drawn(path, scenario, seed, last_mm))
 
 
@@ -40,7 +40,7 @@ def drawn(path: Path, scenario: str, seed: int, last_mm: int) -> Iterator[Pair]:
 
 
 class Looks:
-    """A tracker and what suspects beside it."""
+    """A tracker and the watch for swapped images beside it."""
 
     def __init__(self, calibration: StereoCalibration) -> None:
         settings = StereoTrackerParameters()
@@ -74,7 +74,7 @@ def test_swapped_images_are_suspected(
 @pytest.mark.parametrize(
     "scenario", ["clean", "clutter", "heavy_clutter", "occlusion", "absent", "defocus"]
 )
-def test_images_as_they_should_be_are_not(
+def test_correct_images_are_not_suspected(
     looks: Looks, calibration_path: Path, scenario: str, known: bool
 ) -> None:
     for insertion, left, right in pairs(calibration_path, scenario, 2, 60):

@@ -1,4 +1,4 @@
-"""A short training on a recording of one's own: about two minutes."""
+"""A short training on a user's own recording: about two minutes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def trained(tmp_path: Path, *words: str) -> str:
-    """Run the training; return what it says."""
+    """Run the training; return its output."""
     folders = ["--folder", str(tmp_path / "run"), "--output", str(tmp_path / "net.onnx")]
     done = subprocess.run(
         [sys.executable, str(TRAINING / "train_needle_map.py"), *words, *folders],
@@ -42,9 +42,7 @@ def trained(tmp_path: Path, *words: str) -> str:
     return done.stdout
 
 
-def test_a_training_goes_on_from_weights_and_from_a_checkpoint(
-    tmp_path: Path, recording: Path
-) -> None:
+def test_a_training_continues_from_weights_or_a_checkpoint(tmp_path: Path, recording: Path) -> None:
     pytest.importorskip("torch", reason="PyTorch is an extra: docs/dependencies.md")
     pytest.importorskip("onnx", reason="ONNX is an extra: docs/dependencies.md")
     output = tmp_path / "net.onnx"

@@ -1,4 +1,4 @@
-"""The stored net on patches that it was not trained on, and path-traced scenes to train on."""
+"""The stored net on unseen patches, and path-traced scenes for training."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from needle_sim.path_traced.tracer import load_mitsuba
 from sample_pool import CONTEXT, Batch, batch_of, read_shard, write_shard
 
 UNSEEN = 1_000_000
-"""Shards are numbered from 0."""
+"""Shard number outside of the training, whose shards are numbered from 0."""
 WEIGHTS = (
     Path(__file__).parents[3] / "ros2_ws/src/needle_tracker/needle_tracker/detector/needle_net.onnx"
 )
@@ -27,14 +27,14 @@ _NEAR_PX = 4.0
 
 @pytest.fixture(scope="module")
 def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
-    """Return drawn samples, as the net sees them."""
+    """Return drawn samples as input of the net."""
     path = tmp_path_factory.mktemp("unseen") / "drawn-00000.npz"
     write_shard(path, [0, UNSEEN], patch)
     count = 128
     return batch_of([(read_shard(path), i) for i in range(count)], [0] * count, [False] * count)
 
 
-def test_the_stored_net_shows_needles_that_it_was_not_trained_on(unseen: Batch) -> None:
+def test_the_stored_net_detects_unseen_needles(unseen: Batch) -> None:
     net = cv2.dnn.readNetFromONNX(str(WEIGHTS))
     rows, columns = np.indices((SIZE, SIZE))
     shown, excess, at_ends, without = [], [], [], []
@@ -51,15 +51,15 @@ def test_the_stored_net_shows_needles_that_it_was_not_trained_on(unseen: Batch) 
             at_ends.append(intensity[np.hypot(columns - end[0], rows - end[1]) < _NEAR_PX].sum())
         else:
             without.append(intensity.sum())
-    # Many are hardly to be seen: thin, dark, out of focus, or as their own background shows them.
+    # Many are hardly visible: thin, dark, out of focus, or present in their own background.
     assert np.median(shown) > 0.35
     assert np.median(at_ends) > 0.35
     assert np.mean(without) < 0.4
-    # Its chances are chances: as much needle is shown as there is.
+    # The outputs are calibrated: the mean share of needle is the true one.
     assert abs(np.mean(excess)) < 0.01
 
 
-def test_a_traced_scene_says_where_its_shaft_is() -> None:
+def test_a_traced_scene_gives_the_position_of_its_shaft() -> None:
     pytest.importorskip("mitsuba", reason="Mitsuba is an extra: docs/dependencies.md")
     try:
         mitsuba = load_mitsuba()

@@ -27,11 +27,11 @@ from needle_sim.sequences.boxes import draw_box
 RIGS = ("bench", "top_and_side", "webcams")
 PAIRS = 6
 NEEDLES, ABSENT = 51, 21
-"""Sequences of each half, each rig in turn."""
+"""Number of sequences per half, with and without a needle; the rigs alternate."""
 LOOKED_AT, HELD_BACK = 30_000, 40_000
 """First seed of each half."""
 _STEP = 1e-3
-_BEGIN = (0.02, 0.085)  # insertion of the first pair; webcams see less of the way [m]
+_BEGIN = (0.02, 0.085)  # insertion of the first pair; webcams see less of the path [m]
 _BEGIN_WEBCAMS = (0.015, 0.05)
 _STREAM = 23
 
@@ -45,9 +45,9 @@ class TracedScene:
     rig : str
         One of `RIGS`.
     appearance : str
-        As `draw_appearance` takes it.
+        Name for `draw_appearance`.
     seed : int
-        Keys look, path, noise and a box.
+        Seed of appearance, path, noise and box.
     """
 
     rig: str
@@ -72,13 +72,13 @@ class DrawnSequence:
     Attributes
     ----------
     scene : TracedScene
-        What they show.
+        Scene of the images.
     calibration : Path
-        Of the cameras.
+        Calibration file of the cameras.
     empty, pairs : ndarray of uint8, shape (2, height, width), (N, 2, height, width)
-        Left and right, without the needle and with it.
+        Left and right images without and with the needle.
     insertions : ndarray, shape (N,)
-        What the stage says [m].
+        Insertions of the stage [m].
     tips : ndarray, shape (N, 3)
         The end of the shaft's axis in `rig` [m]; NaN where there is no needle.
     seen : ndarray, shape (N, 2)
@@ -111,9 +111,9 @@ def drawn(folder: Path, wanted: Sequence[TracedScene]) -> Iterator[DrawnSequence
     Parameters
     ----------
     folder : Path
-        Keeps them.
+        Folder of the sequences.
     wanted : sequence of TracedScene
-        Which.
+        Requested sequences.
 
     Raises
     ------

@@ -45,7 +45,7 @@ class Exposure:
     left, right : ndarray of uint8, shape (height, width)
         The images.
     seen : pair of float
-        Share of the last 10 mm that the left and the right camera see.
+        Visible share of the last 10 mm in the left and the right image.
     """
 
     insertion: float
@@ -60,16 +60,16 @@ def insertion_sequence(
 ) -> Iterator[Exposure]:
     """Yield one exposure for each millimetre of a simulated insertion.
 
-    The bevel is turned at random, from held to spun, and away from where the needle strays to.
+    The bevel is turned at random, from held to spun, and back where the needle leaves the axis.
 
     Parameters
     ----------
     calibration : Path
         The rig's calibration file.
     scenario : str
-        One of the renderer's.
+        Scenario of the renderer.
     seed : int
-        Of the renderer, the start and the steering; not negative.
+        Seed of the renderer, the start and the steering; not negative.
     steps : int
         Number of exposures, from 6 mm of insertion on.
     noise : float, optional
@@ -118,11 +118,11 @@ class TrackedRun:
     normalised : ndarray, shape (n,)
         Squared error over its covariance; NaN where there is no tip.
     states : list of TrackState
-        After each pair.
+        State after each pair.
     seen : ndarray of bool, shape (n,)
         Whether both cameras see the needle's end.
     seconds : ndarray, shape (n,)
-        Of the thread's own time, for each pair.
+        CPU time of the thread for each pair [s].
     """
 
     errors: Array
@@ -171,11 +171,11 @@ def track_run(
     Parameters
     ----------
     tracker : NeedleTracker
-        Forgets what it knew.
+        The tracker; it is reset first.
     exposures : iterable of Exposure
         The insertion.
     searching : bool
-        Whether it forgets again before every pair.
+        Whether the tracker is reset before every pair.
     """
     tracker.reset()
     errors, normalised, states, seen, seconds = [], [], [], [], []

@@ -1,1 +1,1 @@
-"""Judgement of a run from outside: what must hold, and who hears what."""
+"""Monitors of a run from outside: invariants, limits, holds and recordings."""

@@ -26,8 +26,8 @@ WATCHDOG_BOUND = 0.2
 # Discovery time of a new publisher [s], whose press counts from then (docs/safety.md,
 # hold_new_press).
 DISCOVERED_WITHIN = 0.2
-# A page's hold may be published so long after the finger is off [s]: an echo counts for 0.25 s
-# (docs/safety.md, hold's end), and the hand is sampled every 0.005 s.
+# Longest time after which a page's hold may still be published once the finger is lifted [s]: an
+# echo counts for 0.25 s (docs/safety.md, hold's end), and the hand is sampled every 0.005 s.
 PAGE_LIFETIME = 0.26
 # Largest lag of a status behind the motors [s].
 _STATUS_LAG = 0.15
@@ -52,7 +52,7 @@ class Violation:
     invariant : str
         Its name.
     at : float
-        When, from the start of the run [s].
+        Time from the start of the run [s].
     text : str
         Observation, with values and units.
     """
@@ -68,7 +68,7 @@ class InvariantMonitor:
     Parameters
     ----------
     bounds : SafetyLimits
-        Of the rig.
+        Limits of the rig.
     release_bound : float
         Longest time from a release or a loss to the last motion [s].
     late : float
@@ -79,7 +79,7 @@ class InvariantMonitor:
     violations : list of Violation
         The first of each kind.
     hold_monitor : HoldMonitor
-        Of the holds that reach the device; used once it has received any.
+        Monitor of the holds that reach the device; used once it has received any.
     """
 
     def __init__(
@@ -223,7 +223,7 @@ class InvariantMonitor:
             self._check_path(at, insertion, rotation)
 
     def observe_waiting(self, at: float, waiting: int) -> None:
-        """Observe how much waits for the recorder's disk [B]."""
+        """Observe the amount of data that waits for the recorder's disk [B]."""
         if waiting > _WAITING:
             self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
 

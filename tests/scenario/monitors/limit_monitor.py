@@ -27,7 +27,7 @@ class SetPointFrames:
     Parameters
     ----------
     counts_per_unit : mapping of int to float
-        Of the drives, by their node ids [1/m] or [1/rad].
+        Counts per unit of the drives, by their node ids [1/m] or [1/rad].
     """
 
     def __init__(self, counts_per_unit: Mapping[int, float]) -> None:
@@ -89,7 +89,7 @@ class SpeedBudget:
         at : float
             Time [s].
         place : float
-            In any unit.
+            Position in any unit.
         """
         most = 0.0
         for sign, least in self._least.items():
@@ -112,7 +112,7 @@ class _Axis:
     motor: SpeedBudget
 
     def said(self, way: float, most: float) -> str:
-        """Return a distance beside its bound, as text."""
+        """Return a distance and its bound as text."""
         return f"{way * self.scale:.4g} {self.unit} (at most {most * self.scale:.4g})"
 
 
@@ -122,7 +122,7 @@ class LimitMonitor:
     Parameters
     ----------
     bounds : SafetyLimits
-        Of the rig.
+        Limits of the rig.
     late : float
         Lateness of a set-point; the next one may follow it so much sooner [s].
     """

@@ -1,1 +1,1 @@
-"""Components of the soak beside the rig's own: bench, person, strangers, page."""
+"""Components of the soak besides the rig's own: bench, person, rogue nodes, page."""

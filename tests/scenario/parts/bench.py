@@ -1,4 +1,4 @@
-"""The bench: a needle moved by the motors and nothing else, and what a tracker tells of it."""
+"""The bench: a needle moved only by the motors, and the measurements of a tracker."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.tissue import Torsion
 
 TICK = 0.01
-"""Between two looks at the motors [s]."""
+"""Period of the observation of the motors [s]."""
 _FRAME_RATE = 20.0
 ANSWER = (0.015, 0.045)
-"""From exposure to answer [s], at least and at most."""
+"""Shortest and longest time from exposure to answer [s]."""
 TIP_NOISE = 0.0002
 """Half width of the noise of a coordinate [m]."""
 _LATEST_ANSWER = 3.0
 _CURVATURE = 1.0 / 0.122
-# The needle takes the motors' way in pieces of at most so much [m], [rad].
+# Largest pieces in which the needle follows the motors [m], [rad].
 _PIECE = 0.0002, 0.1
 # A tip alone says nothing about the heading [rad^2].
 _UNKNOWN_ORIENTATION = 1e6
@@ -53,7 +53,7 @@ class Bench(Component):
     Attributes
     ----------
     motors : Motors
-        At the last tick.
+        Positions at the last tick.
     watchers : list of callable
         Called with the time [s] and the motors at every tick.
     deepest_tip : ndarray, shape (3,)

@@ -62,9 +62,9 @@ class Joystick(c.Component):
     Parameters
     ----------
     hand : JoystickButtons
-        The person's.
+        Buttons of the person.
     name, topic : str
-        Of the component, and where it publishes.
+        Name of the component, and its topic.
     """
 
     def __init__(self, hand: JoystickButtons, name: str = "joy_node", topic: str = "joy") -> None:

@@ -1,4 +1,4 @@
-"""A recorder on a disk that fills, stands still, is slow or broken: the rig's own `Recording`."""
+"""A recorder on a full, stalled, slow or broken disk, with the rig's own `Recording`."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from needle_core.files.bag_topic import BagTopic
 from scenario.faults import Fault, Kind
 from scenario.monitors.bag_monitor import WAITING_LIMIT, BagMonitor
 
-# How often the worker looks for jobs [s], and what each takes [s], at least and at most.
+# Period of the worker, and shortest and longest duration of a job [s].
 _WORK, _JOB = 0.005, (2e-6, 40e-6)
 _SLOWEST_JOB = 0.005
-# A recording ends in order where no more is left [B].
+# Free space at which a recording ends [B].
 _RESERVE = 1_000_000
 _ROOM = 10**9
 
 
 class Disk:
-    """The disk of a recorder's bags: real files, spoilt on their way.
+    """Disk of a recorder's bags: real files, with injected faults.
 
     Attributes
     ----------
     room : int
-        What is said to be left [B].
+        Reported free space [B].
     error : int
-        What every write meets, as `errno` has it; 0: nothing.
+        `errno` of every write; 0: no error.
     is_frozen : bool
-        Whether no write ends.
+        Whether writes never end.
     slowness : float
-        What each job takes longer [s].
+        Added duration of each job [s].
     """
 
     def __init__(self) -> None:
@@ -53,18 +53,18 @@ class Disk:
         self._count = 0
 
     def next_bag(self) -> Path:
-        """Return where the next recorder records."""
+        """Return the folder of the next bag."""
         self._count += 1
         return self._folder / f"bag_{self._count}"
 
     def spoil(self, fault: Fault) -> Callable[[], None]:
-        """Let a fault begin; returns what ends it."""
+        """Begin a fault; returns the function that ends it."""
         if fault.kind is Kind.STUCK:
             self.is_frozen = True
         elif fault.kind is Kind.SLOW:
             self.slowness = fault.size * _SLOWEST_JOB
         elif fault.kind is Kind.OFF and fault.size < 0.5:
-            # Others fill it, and it can be seen.
+            # Others fill the disk: the reported free space shows it.
             self.room = 0
         else:
             self.error = errno.EIO if fault.kind is Kind.GARBAGE else errno.ENOSPC
@@ -74,7 +74,7 @@ class Disk:
         self.room, self.error, self.is_frozen, self.slowness = _ROOM, 0, False, 0.0
 
     def close(self) -> None:
-        """Remove all that is on it."""
+        """Remove all files of the disk."""
         shutil.rmtree(self._folder)
 
 
@@ -110,7 +110,7 @@ class _Space(FreeSpace):
 
 
 class _Jobs:
-    """A `Worker` whose jobs are done when time is given to it."""
+    """A `Worker` whose jobs run when it is given time."""
 
     def __init__(self, do: RunJob, end: Job) -> None:
         self._do, self._end = do, end
@@ -125,7 +125,7 @@ class _Jobs:
         self._jobs.append(job)
 
     def work(self, now: float, seconds: float, cost: Callable[[], float]) -> None:
-        """Do as many jobs as `seconds` have time for."""
+        """Run as many jobs as `seconds` allow."""
         if not self._jobs and now >= self._due:
             self._due = self._do(no_op)
         while self._jobs and seconds > 0.0:
@@ -139,16 +139,16 @@ class _Jobs:
 
 
 class RecorderStandIn(Component):
-    """Hands all that it hears to a `Recording`; text in the place of CDR.
+    """Passes all received messages to a `Recording`, as text instead of CDR.
 
     Parameters
     ----------
     disk : Disk
-        Where it records.
+        Disk of the bags.
     topics : iterable of Output
-        What it hears.
+        Recorded topics.
     chance : Random
-        Draws how long jobs take.
+        Draws the durations of jobs.
 
     Attributes
     ----------
@@ -185,18 +185,18 @@ class RecorderStandIn(Component):
         self.timers = (Timer(_WORK, self._work),)
 
     def cut(self, now: float) -> None:
-        """End, as the kernel ends it for a process that is killed."""
+        """End as a killed process, whose files the kernel closes."""
         self._killed_at = now
         for file in self._bag.opened:
             file.close()
 
     def losses(self, *, check_killed: bool) -> list[str]:
-        """End it in order, unless it was killed; return what its bag lacks and does not name.
+        """End the recording unless it was killed; return the losses that its bag does not report.
 
         Parameters
         ----------
         check_killed : bool
-            Whether the bag of a killed one counts: nothing else kept it from writing.
+            Whether to check the bag of a killed recorder: no other fault prevented its writing.
         """
         if self._killed_at is not None:
             return self._monitor.losses_of_killed(self._killed_at) if check_killed else []
@@ -206,7 +206,7 @@ class RecorderStandIn(Component):
                 self._note_refusal()
             if self._refused_at is None:
                 return [f"{self._bag.directory} is not whole: {self.recording.error}"]
-            # A disk that refused data leaves what a kill leaves.
+            # A disk that refused data leaves the same as a kill.
             return self._monitor.losses_of_killed(self._refused_at) if check_killed else []
         return self._monitor.losses_of_ended()
 

@@ -27,17 +27,17 @@ class TrackerModel:
     Attributes
     ----------
     rate : float
-        Of the transforms [Hz].
+        Rate of the transforms [Hz].
     noise, heading_noise : float
         Standard deviation of a coordinate [m], and of the heading [rad].
     latency : float
-        From the measurement to the arrival [s].
+        Time from the measurement to the arrival [s].
     lost : float
         Share of lost transforms.
     offset : float
         Distance from the sensor to the tip [m].
     is_late : bool
-        Whether the stamp is that of the arrival.
+        Whether the stamp is the time of the arrival.
     """
 
     rate: float = 40.0
@@ -57,7 +57,7 @@ class SimulatedTracker(Component):
     model : TrackerModel
         Its errors.
     seed : int
-        Of their random numbers.
+        Seed of the random errors.
     spoil : callable
         Changes a measurement (number of the transform, matrix in mm, stamp) into the bytes sent;
         by default they are those of PLUS.

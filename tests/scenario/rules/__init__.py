@@ -1,1 +1,1 @@
-"""Safety rules, one by one: a scene in which each counts, and the bug that takes it away."""
+"""Safety rules, one by one: a scene that the rule protects, and the bug that disables it."""

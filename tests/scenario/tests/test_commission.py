@@ -1,4 +1,4 @@
-"""The script of commission on emulated drives, with a person who does what it asks for."""
+"""The script of commission on emulated drives, with a person who follows its instructions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EVENTS = {BY_HAND[fault.name]: fault.event for fault in FAULTS if fault.name in 
 
 
 class Person:
-    """Answers, and does by hand what the script asks for, one second later."""
+    """Person who answers, and follows each instruction one second later."""
 
     def __init__(self, rig: ConformanceRig, scale: float = 1.0) -> None:
         self.rig, self.scale = rig, scale
@@ -80,7 +80,7 @@ def test_real_drives_move_only_while_a_person_holds(monkeypatch: pytest.MonkeyPa
     assert rig.place == begin
 
 
-def test_a_wrong_scale_and_a_long_way_are_not_passed() -> None:
+def test_a_wrong_scale_and_a_long_distance_do_not_pass() -> None:
     rig = ConformanceRig(1, drives={"insertion_start": 0.001})
     rows = commission(rig, Person(rig, scale=1.05))
     assert next(rows).passed
@@ -91,5 +91,5 @@ def test_a_wrong_scale_and_a_long_way_are_not_passed() -> None:
 
 
 @pytest.mark.parametrize("measured", [0.1, float("nan")])
-def test_an_unknown_way_is_no_failure(measured: float) -> None:
+def test_an_unknown_distance_is_no_failure(measured: float) -> None:
     assert Row("", "", measured, 0.2).passed

@@ -1,4 +1,4 @@
-"""Driver and emulated drives: homing, set-up and cycles in which nothing goes wrong."""
+"""Driver and emulated drives: homing, set-up and cycles without faults."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SYNC, DEVICE_TYPE, LIMITS, HOMING_SPEEDS = 0x080, 0x1000, 0x607D, 0x6099
 
 
 class Bus:
-    """Every frame of the bus; loses those of an identifier for 0.3 s, when told until when."""
+    """Records every frame; loses those of one identifier for 0.3 s before `until`."""
 
     def __init__(self, loses: int = 0) -> None:
         self.frames: list[tuple[float, str, CanFrame]] = []
@@ -35,7 +35,7 @@ class Bus:
         return (Arrival(0.0, message),)
 
     def orders(self, *cob_ids: int, since: float = 0.0) -> list[tuple[float, CanFrame]]:
-        """Return what the driver sent under these COB-IDs."""
+        """Return the frames that the driver sent under these COB-IDs."""
         return [
             (time, frame)
             for time, sender, frame in self.frames
@@ -44,11 +44,11 @@ class Bus:
 
 
 def index_of(frame: CanFrame) -> int:
-    """Return the index of the object that an SDO frame is about."""
+    """Return the object index of an SDO frame."""
     return int.from_bytes(frame.data[1:3], "little")
 
 
-def test_a_step_goes_in_even_cycles_to_where_it_should() -> None:
+def test_a_step_moves_in_equal_cycles_to_its_target() -> None:
     bus = Bus()
     rig = VirtualRig(1, faults=(bus,))
     rig.home()
@@ -67,7 +67,7 @@ def test_a_step_goes_in_even_cycles_to_where_it_should() -> None:
 
 
 def home(rig: VirtualRig) -> float:
-    """Home it; return how long that took from the answer on [s]."""
+    """Home the rig; return the duration from the answer on [s]."""
     rig.until(lambda: rig.hand.status.state == "DISABLED", "the driver")
     rig.call("device/confirm_needle_out", True)
     rig.call("device/home")
@@ -76,9 +76,9 @@ def home(rig: VirtualRig) -> float:
     return rig.runner.now - begin
 
 
-def test_drives_that_take_speeds_in_rpm_and_say_so_home_at_the_speed_that_they_are_told() -> None:
+def test_drives_that_report_speeds_in_rpm_home_at_the_requested_speed() -> None:
     rig = VirtualRig(1, drives={"rpm": True, "insertion_start": 0.002})
-    # 2 mm at 2 mm/s and the way off the switch.
+    # 2 mm at 2 mm/s, and the distance off the switch.
     assert 1.0 < home(rig) < 1.6
     assert rig.place[0] == pytest.approx(0.0, abs=2e-5)
 
@@ -91,7 +91,7 @@ def test_homing_from_anywhere_is_no_alarm(start: float) -> None:
 
 
 @pytest.mark.parametrize(("lag", "late"), [(0.0, 0.012), (0.02, 0.004)])
-def test_steps_that_are_broken_off_and_go_on_are_no_alarm(lag: float, late: float) -> None:
+def test_aborted_and_continued_steps_raise_no_alarm(lag: float, late: float) -> None:
     rng = random.Random(3)
     rig = VirtualRig(1, drives={"insertion_lag": lag}, faults=(delay(CAN, late),))
     rig.home()
@@ -107,7 +107,7 @@ def test_steps_that_are_broken_off_and_go_on_are_no_alarm(lag: float, late: floa
     assert rig.place[0] > 0.001
 
 
-def test_both_drives_are_asked_side_by_side_and_homing_begins_when_both_have_taken_limits() -> None:
+def test_drives_are_set_up_in_parallel_and_homing_starts_when_both_have_limits() -> None:
     bus = Bus(loses=0x582)
     rig = VirtualRig(1, faults=(bus,))
     rig.until(lambda: rig.hand.status.state == "DISABLED", "the driver")
@@ -118,7 +118,7 @@ def test_both_drives_are_asked_side_by_side_and_homing_begins_when_both_have_tak
     assert asked[0x601][0] < asked[0x602][-1]
     assert asked[0x602][0] < asked[0x601][-1]
     rig.call("device/confirm_needle_out", True)
-    # The rotation drive's answers are lost for a while: it is asked again.
+    # The rotation drive's answers are lost for a while, so the request is repeated.
     begin, bus.until = rig.runner.now, rig.runner.now + 0.3
     rig.call("device/home")
     replied = rig.runner.now
@@ -134,7 +134,7 @@ def test_both_drives_are_asked_side_by_side_and_homing_begins_when_both_have_tak
     assert replied > bus.until
 
 
-def test_an_emergency_stop_calls_a_set_up_off_until_it_is_released() -> None:
+def test_an_emergency_stop_cancels_a_set_up_until_it_is_released() -> None:
     scene = VirtualRig(1)
     other = scene.start_node(ESTOP)
     scene.act(other, Publish(ESTOP.topic, EmergencyStop(True)))

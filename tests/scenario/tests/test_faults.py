@@ -1,4 +1,4 @@
-"""Schedules: drawn from the vocabulary alone, read as they were written, shrunk to what matters."""
+"""Schedules: drawn from the vocabulary, read as written, shrunk to the relevant faults."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenario.faults import VOCABULARY, Fault, Kind, draw_schedule, read_schedul
 from scenario.shrinking import shrink
 
 
-def test_every_part_is_spoilt_in_every_way_it_knows() -> None:
+def test_every_part_gets_every_kind_of_its_faults() -> None:
     drawn = [fault for seed in range(2000) for fault in draw_schedule(seed)]
     known = {(part, kind) for part, kinds in VOCABULARY.items() for kind in kinds}
     assert {(fault.part, fault.kind) for fault in drawn} == known
@@ -20,14 +20,14 @@ def test_every_part_is_spoilt_in_every_way_it_knows() -> None:
     assert floods == set(faults.ROGUE_TOPICS)
 
 
-def test_a_part_more_shifts_no_fault_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_additional_part_changes_no_fault_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     with_all = [draw_schedule(seed) for seed in range(50)]
     monkeypatch.delitem(faults._DRAWN_ALONE, faults.PAGE)
     for seed, drawn in enumerate(with_all):
         assert [fault for fault in drawn if fault.part != faults.PAGE] == draw_schedule(seed)
 
 
-def test_a_schedule_is_read_as_it_was_written_and_nothing_else_is(tmp_path: Path) -> None:
+def test_a_written_schedule_is_read_and_others_are_rejected(tmp_path: Path) -> None:
     drawn, file = draw_schedule(3), tmp_path / "one.json"
     write_schedule(file, 3, drawn, "because")
     assert read_schedule(file) == (3, drawn)
@@ -37,7 +37,7 @@ def test_a_schedule_is_read_as_it_was_written_and_nothing_else_is(tmp_path: Path
             read_schedule(file)
 
 
-def test_faults_that_do_not_matter_are_left_out() -> None:
+def test_irrelevant_faults_are_dropped() -> None:
     drawn = [Fault(part, Kind.OFF, 1.0, 2.0, 0.5) for part in ("operator", "/joy", "bus")]
     kept = shrink(drawn, lambda some: {"operator", "bus"} <= {fault.part for fault in some})
     assert [(fault.part, fault.lasts) for fault in kept] == [("operator", 1.0), ("bus", 1.0)]

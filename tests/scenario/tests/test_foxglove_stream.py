@@ -1,4 +1,4 @@
-"""What a WebSocket client of live_view decodes during a run is what the bag of the run holds."""
+"""Data that a WebSocket client of live_view decodes during a run agree with the bag of the run."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from needle_bags.live.foxglove_port import FoxglovePort  # noqa: E402
 CALIBRATION = Path(__file__).parents[3] / "ros2_ws/src/needle_tracker/config/calibration.yaml"
 PATIENCE = 20.0
 TIP_POSE = "/needle/tip_pose"
-# Messages on their way at the end, and before live_view is discovered.
+# Messages in transit at the end, and before live_view is discovered.
 UNDERWAY = 12
 
 
 class CountingPort(FoxglovePort):
-    """Counts what it sends, and knows when all topics are watched."""
+    """Counts sent messages, and reports when all topics are watched."""
 
     def __init__(self, view: LiveView) -> None:
         super().__init__(0, view.channels)
@@ -66,7 +66,7 @@ class CountingPort(FoxglovePort):
 
 
 class CalibrationSource(Component):
-    """Publishes the calibration again and again, as a tracker that restarts."""
+    """Publishes the calibration repeatedly, as a restarting tracker does."""
 
     name = "calibration_source"
     outputs = (Output("stereo_tracker/calibration", m.Text, LATCHED),)
@@ -77,7 +77,7 @@ class CalibrationSource(Component):
 
 
 class Client:
-    """A client that subscribes to everything, and decodes it by the advertised schemas alone."""
+    """Client that subscribes to everything, and decodes it only by the advertised schemas."""
 
     def __init__(self, connection: Any) -> None:
         self.received: dict[str, list[bytes]] = defaultdict(list)

@@ -13,7 +13,7 @@ from scenario.monitors.limit_monitor import LimitMonitor, SpeedBudget
 BOUNDS = SafetyLimits()
 
 
-def test_a_pace_is_of_all_spans() -> None:
+def test_the_speed_budget_covers_all_spans() -> None:
     rng = random.Random(1)
     ways = [(0.1 * n, rng.uniform(-1.0, 1.0)) for n in range(40)]
     pace = SpeedBudget(3.0)
@@ -24,7 +24,7 @@ def test_a_pace_is_of_all_spans() -> None:
 
 
 @pytest.mark.parametrize(("share", "said"), [(1.0, 0), (-1.0, 0), (1.02, 2), (-1.02, 2)])
-def test_motors_a_little_beyond_their_speed_are_found(share: float, said: int) -> None:
+def test_motors_slightly_above_their_speed_limit_are_detected(share: float, said: int) -> None:
     monitor, told = LimitMonitor(BOUNDS), set()
     for tick in range(4000):
         way = share * tick * 0.005

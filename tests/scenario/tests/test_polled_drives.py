@@ -46,7 +46,7 @@ def test_a_fast_step_ends_where_it_should(make: Callable[[], ConformanceRig]) ->
     rig.runner.run(0.8)
     assert rig.hand.results[stamp] == "succeeded"
     assert rig.hand.status.simulated
-    # The home is where the driver finds out that the axis has left the switch.
+    # The driver sets the home where it observes that the axis has left the switch.
     assert rig.place == pytest.approx((0.002, 0.5), abs=1e-4)
     assert rig.hand.joints == pytest.approx((0.002, 0.5), abs=2.5e-4)
 

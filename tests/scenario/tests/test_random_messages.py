@@ -1,4 +1,4 @@
-"""Whatever others publish, no component fails on it, and no motor turns without a hold."""
+"""Random messages of other nodes: no component fails, and no motor turns without a hold."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ SECONDS = 10.0
 
 
 class Careless(Component):
-    """Publishes and calls at random whatever the others hear and offer; never holds."""
+    """Publishes and calls at random everything that the others receive and offer, except holds."""
 
     name = "careless"
 
     def __init__(self, others: list[Component], chance: random.Random) -> None:
         rows = {row.topic: row for other in others for row in other.inputs}
-        # A press by chance is a press, a rig has one device, and where the motors are is the
-        # simulation's own affair.
+        # A random press is a valid press, a rig has one device, and the motor positions belong to
+        # the simulation.
         for left_out in ("device/hold", "joy", "device/status", "sim/drive_positions"):
             rows.pop(left_out, None)
         self.outputs = [Output(row.topic, row.message, row.delivery) for row in rows.values()]
-        # Who confirms that the needle is out may mean it.
+        # A confirmation that the needle is out may be meant.
         self._offered = [
             service
             for other in others
@@ -54,7 +54,7 @@ class Careless(Component):
         try:
             message = convert.from_ros(row.message, random_message(kind, self._chance))
         except ValueError:
-            # A node refuses it before its component is told.
+            # A node rejects it before its component receives it.
             return
         self.published.add(row.topic)
         yield Publish(row.topic, message)
@@ -65,7 +65,7 @@ class Careless(Component):
 
 
 @pytest.mark.parametrize("level", ["drive", "camera"])
-def test_nothing_that_a_rig_is_sent_fails_or_moves_it(level: str) -> None:
+def test_random_messages_neither_fail_nor_move_a_rig(level: str) -> None:
     parameters = command_line_parameters(parse(["--level", level]), Path())
     parts = [
         *make_rig(parameters),

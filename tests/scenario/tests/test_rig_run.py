@@ -20,7 +20,7 @@ def violated(result: RunResult) -> set[str]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for a person who gets nowhere no longer than it takes to see that."""
+    """Shorten the time limits of a run without progress."""
     monkeypatch.setattr(rig_run, "_GO_ON", 15.0)
     monkeypatch.setattr(rig_run, "_DRAW_OUT", 15.0)
 
@@ -32,7 +32,7 @@ def test_an_undisturbed_run_converges() -> None:
     assert not result.violations
 
 
-def test_a_seed_gives_one_run() -> None:
+def test_a_seed_determines_the_run() -> None:
     one, again = (run(3, schedule_of(3)) for _ in range(2))
     assert one.faults
     assert run(3, one.relative_to_moments).digest == again.digest == one.digest
@@ -51,7 +51,7 @@ def test_each_schedule_has_its_bug() -> None:
 
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("name", MENDED)
-def test_what_once_violated_does_not_any_more(name: str) -> None:
+def test_a_fixed_violation_does_not_return(name: str) -> None:
     result = run(*read_schedule(SCHEDULES / f"{name}.json"))
     assert not result.violations
     assert len(result.relative_to_moments) == len(result.faults), "each fault met its moment"
@@ -59,7 +59,7 @@ def test_what_once_violated_does_not_any_more(name: str) -> None:
 
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("name", MENDED)
-def test_what_once_violated_would_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fixed_violation_returns_with_its_bug(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     MENDED[name].plant(monkeypatch)
     assert MENDED[name].invariant in violated(run(*read_schedule(SCHEDULES / f"{name}.json")))
 

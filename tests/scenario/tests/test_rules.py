@@ -1,4 +1,4 @@
-"""Every safety rule: a scene in which it counts, and a bug that takes it away."""
+"""Every safety rule: a scene that it protects, and a bug that disables it."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def test_each_rule_has_a_scene_and_a_bug() -> None:
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_a_rule_counts(rule: str) -> None:
+def test_a_scene_passes_with_its_rule(rule: str) -> None:
     SCENES[rule]()
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_without_its_rule_a_scene_goes_wrong(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_fails_without_its_rule(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
     BUGS[rule](monkeypatch)
     with pytest.raises((AssertionError, UserError)):
         SCENES[rule]()

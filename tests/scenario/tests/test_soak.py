@@ -1,4 +1,4 @@
-"""The command: what it says of a night that somebody ends."""
+"""The soak command: its report after an interruption."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def ended(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     monkeypatch.setattr(soak, "results_here", results)
     monkeypatch.setattr(soak, "shrink", shrinking)
-    # A shell's background ignores SIGINT.
+    # Background jobs of a shell ignore SIGINT.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("ended")
-def test_what_is_interrupted_says_how_far_it_came(
+def test_an_interrupted_soak_reports_its_progress(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     figures, kept = tmp_path / "soak.json", tmp_path / "failures"

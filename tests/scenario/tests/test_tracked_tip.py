@@ -154,7 +154,7 @@ def test_a_tracker_steers_the_needle_into_the_plane(case: str) -> None:
     assert 0.7 < np.mean(of_heading) / 2.0 < 1.2
 
 
-def test_a_measured_heading_makes_the_estimate_better() -> None:
+def test_a_measured_heading_improves_the_estimate() -> None:
     early = []
     for measured in (False, True):
         steering = {

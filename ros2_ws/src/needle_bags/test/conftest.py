@@ -1,4 +1,4 @@
-"""Bags that tests share: made-up runs, the committed bag's first steps, and its report."""
+"""Bags that tests share: made-up runs, the start of the committed bag, and its report."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def regression() -> Path:
 
 @pytest.fixture(scope="session")
 def made_up(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A made-up run as it is read."""
+    """A made-up run, as read from its bag."""
     return read_run(write_run(tmp_path_factory.mktemp("made_up") / "run"))
 
 
 @pytest.fixture(scope="session")
 def cut_bag(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], Path]:
-    """Copies the committed bag up to an insertion [m]: eight steps, or the first pictures."""
+    """Return a function that copies the committed bag up to an insertion [m]."""
     run, contents = read_run(BAG), read_contents(BAG)
 
     def cut(insertion: float) -> Path:
@@ -72,7 +72,7 @@ def first_pictures(cut_bag: Callable[[float], Path]) -> Path:
 
 @pytest.fixture(scope="session")
 def reported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, str]:
-    """The committed bag with a tip that is no number and markup in its texts; and its report."""
+    """The committed bag with a NaN tip and markup in its texts, and its report."""
     bag = tmp_path_factory.mktemp("reported") / "bag"
     contents = read_contents(BAG)
     custom = contents.custom_data | {

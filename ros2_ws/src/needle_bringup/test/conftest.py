@@ -1,4 +1,4 @@
-"""What tests of several folders share: a made-up run, and compiled code that counts to no test."""
+"""Shared fixtures: a made-up run, and compiled code that is loaded before the tests."""
 
 from __future__ import annotations
 

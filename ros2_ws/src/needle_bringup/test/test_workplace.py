@@ -1,4 +1,4 @@
-"""What a command starts: how it ends is told in one line, and nothing of it is left."""
+"""Processes of a command: their end is reported in one line, and nothing of them is left."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_failed_command_is_reported_with_its_last_line(monkeypatch: pytest.Mon
         ran(["/bin/simulate"], what="trial_1")
 
 
-def test_a_folder_is_kept_where_an_error_may_name_a_log_in_it(tmp_path: Path) -> None:
+def test_a_folder_is_kept_if_an_error_may_name_a_log_in_it(tmp_path: Path) -> None:
     for error, left in ((None, False), (KeyboardInterrupt(), False), (UserError("log"), True)):
         folders = []
         try:

@@ -47,7 +47,7 @@ def test_without_a_home_nothing_is_cached(
     assert not list((tmp_path / "tmp").iterdir())
 
 
-def test_code_that_is_edited_in_any_room_of_its_package_is_compiled_anew(package: Path) -> None:
+def test_code_edited_in_any_folder_of_its_package_is_recompiled(package: Path) -> None:
     room = package / "inner"
     room.mkdir()
     for folder in (package, room):
@@ -75,7 +75,7 @@ def _weighted(weight: float, one: float, other: float) -> float:
     return one + weight * (other - one)
 
 
-def test_products_and_sums_are_rounded_as_pythons_are() -> None:
+def test_products_and_sums_are_rounded_as_in_python() -> None:
     draw = random.Random(4).gauss
     for _ in range(1000):
         numbers = draw(0.0, 1.0), draw(0.0, 1.0), draw(0.0, 1.0)

@@ -27,7 +27,7 @@ _NUMBERS = itertools.cycle(range(3, 99))
 
 
 def example(hint: Any, name: str = "") -> Any:
-    """Return a value of a type whose every number is another one, exact in three digits."""
+    """Return a value of a type whose numbers are all different, exact to three digits."""
     arguments = get_args(hint)
     if hint is int:
         return next(_NUMBERS) + (STAMP if name.endswith("_ns") else 0)
@@ -58,11 +58,11 @@ MESSAGES = (
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
-def test_a_message_goes_there_and_back_with_and_without_ros_and_across(message: Any) -> None:
+def test_a_message_round_trips_with_and_without_ros_and_across(message: Any) -> None:
     kind = ros_type(type(message))
     written = STORE.serialize_cdr(Converter(rosbags_types(STORE)).to_ros(message), kind)
     assert from_ros(type(message), STORE.deserialize_cdr(written, kind)) == message
-    # No wheel on PyPI brings tf2_msgs.
+    # No wheel on PyPI contains tf2_msgs.
     if importlib.util.find_spec(kind.partition("/")[0]) is not None:
         types = rclpy_types()
         for data in (serialize_message(Converter(types).to_ros(message)), bytes(written)):
@@ -78,7 +78,7 @@ def test_a_plain_marker_looks_like_an_obstacle() -> None:
     assert (stamp.sec, stamp.nanosec, list(marker.points)) == (0, 0, [])
 
 
-def test_a_hold_s_frame_is_its_source_and_session() -> None:
+def test_the_frame_of_a_hold_is_its_source_and_session() -> None:
     joy = rclpy_types().make("sensor_msgs/msg/Joy")()
     joy.header.stamp.nanosec = 7
     for frame_id, source, session in (

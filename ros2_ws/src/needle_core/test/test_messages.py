@@ -7,7 +7,7 @@ import math
 from needle_core.messages import HOLD_LIFETIME, HoldSession, HoldState
 
 
-def test_a_session_counts_whatever_the_clock_does() -> None:
+def test_a_session_counts_independently_of_the_clock() -> None:
     session = HoldSession("operator")
     said = [session.next_message(stamp, pressed=stamp > 5, speed=0.5) for stamp in (255, 7, 3)]
     assert said == [
@@ -17,7 +17,7 @@ def test_a_session_counts_whatever_the_clock_does() -> None:
     ]
 
 
-def test_a_process_that_starts_anew_has_another_session() -> None:
+def test_a_restarted_process_has_another_session() -> None:
     before, after = (
         HoldSession("operator", math.inf).next_message(at, pressed=True) for at in (16, 0)
     )

@@ -10,7 +10,7 @@ from needle_core.messages import quaternion_from_rotation
 AXES = np.eye(3)
 
 
-def test_a_rotation_is_scipys_quaternion() -> None:
+def test_a_rotation_gives_scipys_quaternion() -> None:
     turns = Rotation.from_rotvec(np.vstack([np.pi * AXES, 1e-8 * AXES]))
     for rotation in (*Rotation.random(50, random_state=1), *turns):
         matrix = rotation.as_matrix()

@@ -1,4 +1,4 @@
-"""What the tests share: the calibration, settings, and images drawn by the tests themselves."""
+"""Shared fixtures: the calibration, settings, and images drawn by the tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["calibration", "calibration_path", "make_arc", "make_line", "settings
 
 
 def _light_and_dark(view: RefractedCamera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the background of a view, and how far sheath and entry hole cover its pixels."""
+    """Return the background of a view, and the coverage of its pixels by sheath and entry hole."""
     shape = (view.camera.height, view.camera.width)
     v, u = np.mgrid[0 : shape[0], 0 : shape[1]]
     hole = view.project(np.zeros(3))
@@ -27,7 +27,7 @@ def _light_and_dark(view: RefractedCamera) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.lru_cache(maxsize=2)
 def _grain(shapes: tuple[tuple[int, int], ...], seed: int, noise: float) -> list[np.ndarray]:
-    """Return the images' noise; most tests draw one pair after another with the same."""
+    """Return the images' noise; cached, because most tests draw several pairs with the same."""
     rng = np.random.default_rng(seed)
     return [rng.normal(0.0, noise, shape) for shape in shapes]
 

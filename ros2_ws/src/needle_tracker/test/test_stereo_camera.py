@@ -35,7 +35,7 @@ ASK = Send(PAIRS, ("next",))
 
 
 class Rig:
-    """The component called directly, at virtual times."""
+    """The component, called directly in virtual time."""
 
     def __init__(self, calibration: StereoCalibration, **parameters: Any) -> None:
         self.camera = StereoCamera(StereoCameraParameters(**parameters), calibration)
@@ -44,11 +44,11 @@ class Rig:
         self.first = list(self.tick(Moment(0.0, 0)))
 
     def asks(self, seconds: float) -> bool:
-        """Let a tick happen; return whether it asks for a pair."""
+        """Run a tick; return whether it requests a pair."""
         return ASK in list(self.tick(Moment(seconds, 0)))
 
     def gives(self, event: Any, seconds: float = 0.0) -> list[Action]:
-        """Return what the component does with what the source gives."""
+        """Return the actions of the component after an event of the source."""
         return list(self.camera.ports[0].handler((event,), Moment(seconds, 0)))
 
     def pair(self, left_ns: int = 0, right_ns: int = 0) -> StampedPair:
@@ -96,7 +96,7 @@ def test_stamps_exclude_the_latency_and_are_equal_for_a_triggered_pair(
 
 
 def test_one_pair_at_a_time_is_requested(calibration: StereoCalibration) -> None:
-    """A camera slower than the ticks is asked again when it has given, not a tick later."""
+    """A slow camera gets the next request after its answer, not a tick later."""
     rig = Rig(calibration)
     assert not rig.asks(0.05)
     assert not rig.asks(0.10)
@@ -149,7 +149,7 @@ def test_the_end_of_a_recording_reports_missing_frames(calibration: StereoCalibr
 
 
 class Pairs(Component):
-    """In place of a real source: answers each request with a pair."""
+    """Stand-in for a real source: answers each request with a pair."""
 
     name = "source"
 
@@ -186,7 +186,7 @@ def test_a_thread_reads_the_source() -> None:
     end, unreadable, lost, mistake = (arrived.get(timeout=60.0) for _ in given)
     assert (end(), unreadable()) == ((EndOfRecording("all"),), (None,))
     assert lost == PortChange("unplugged?")
-    # A mistake of ours ends the node that takes it.
+    # An internal error ends the node that receives it.
     with pytest.raises(ZeroDivisionError):
         mistake()
     port.close()

@@ -1,4 +1,4 @@
-"""The tracker's component, called directly: messages in; answers, health and logs out."""
+"""The component of the tracker, called directly: messages in; answers, health and logs out."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SECOND = 1_000_000_000
 
 
 class Bench:
-    """The component, what it is told, and the last that it said."""
+    """The component, its input, and its last output."""
 
     def __init__(self, tracker: StereoTipTracker) -> None:
         self.tracker, self.now = tracker, 0.0
@@ -74,7 +74,7 @@ class Bench:
         self.hear(f"stereo/{side}/image_raw", dataclasses.replace(image, **fields))
 
     def pair(self, stamp: int, left: Any = PIXELS, right: Any = PIXELS, **fields: Any) -> bool:
-        """Let a pair follow its joint state; return whether the answer is a tip."""
+        """Send a joint state and a pair; return whether the answer is a tip."""
         answers = len(self.sent["needle/tip_pose"])
         self.joints(stamp)
         self.image("left", stamp, left)
@@ -161,13 +161,13 @@ def test_time_running_backwards_gives_no_tip(bench: Bench) -> None:
     assert not bench.pair(5 * SECOND)
     assert "repeated" in bench.said("images")[1]
     assert bench.pair(5 * SECOND + 1000)
-    # Far back a new recording has begun: its first pair is refused, the next is looked at.
+    # A large step back is a new recording: its first pair is rejected, the next processed.
     assert not bench.pair(SECOND)
     assert bench.pair(SECOND + 1000)
 
 
 def info(camera: Camera, fields: dict[str, Any]) -> m.CameraInfo:
-    """The message of a sensor, with an roi (x, y, width, height) and binning."""
+    """Return the message of a sensor, with an roi (x, y, width, height) and binning."""
     x, y, width, height = fields.get("roi", (0, 0, 0, 0))
     message = m.CameraInfo(0, "", camera.height, camera.width, "plumb_bob", (), (), (), ())
     roi = m.RegionOfInterest(x, y, width, height)
@@ -209,7 +209,7 @@ def test_a_camera_that_runs_at_another_resolution_gives_no_tip(
     assert bench.said("images") == (Level.ERROR, f"{reason}, the calibration for 1024x768")
     assert not bench.pair(10)
     assert bench.said("images")[1].startswith(f"pair refused: {reason}")
-    # A sensor that is larger than its images, and a driver that knows nothing, contradict nothing.
+    # A sensor larger than its images, and a driver without data, are no contradiction.
     unknown = dataclasses.replace(sensor, width=0, height=0)
     for number, message in enumerate(
         (info(sensor, {"binning_x": 2, "binning_y": 2}), info(unknown, {}))
@@ -277,7 +277,7 @@ def test_swapped_images_are_a_warning(bench: Bench) -> None:
     assert level is Level.WARN
     assert "seem to be swapped" in message
     assert "parameters left and right" in message
-    # What is still so is not logged again.
+    # An unchanged state is not logged again.
     bench.check(0.1)
     assert sum("seem to be swapped" in text for text in bench.logs) == 1
 

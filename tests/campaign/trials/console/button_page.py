@@ -1,4 +1,4 @@
-"""A page of one button with the console's hold behind it, as any page of the console has it."""
+"""Page with one button and the console's hold, like any page of the console."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ _PAGE = """<!doctype html>
 def serving_button(
     on_state: Callable[[PageHold], None], on_notice: Callable[[str], None]
 ) -> Iterator[tuple[int, HoldServer]]:
-    """Serve it; yields the page's port, and the hold's server.
+    """Serve the page; yields its port and the hold server.
 
     Parameters
     ----------
     on_state, on_notice : callable
-        As `HoldServer` takes them.
+        Callbacks of `HoldServer`.
     """
     with (
         tempfile.TemporaryDirectory(prefix="needle_page_") as folder,
@@ -67,4 +67,4 @@ def serving_button(
 
 class _Page(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
-        """Say nothing of requests."""
+        """Do not log requests."""

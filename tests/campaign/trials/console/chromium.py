@@ -1,7 +1,7 @@
 """A real browser without a screen, led by its DevTools protocol.
 
-Not by playwright, which makes every page believe that it is seen and focused: what a page does that
-is not is what is tried here.
+playwright makes every page appear visible and focused, but the trials need hidden and unfocused
+pages.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _KEY = {"key": " ", "code": "Space", "windowsVirtualKeyCode": 32}
 
 
 def chromium() -> str | None:
-    """Return the browser's path; None where it is not installed (Debian's package `chromium`)."""
+    """Return the path of the browser; None if Debian's package `chromium` is not installed."""
     return shutil.which("chromium")
 
 
 class Chromium:
-    """A browser of its own, with an empty profile.
+    """Separate browser process with an empty profile.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Chromium:
     """
 
     def __init__(self, folder: Path) -> None:
-        # Only what tries a browser needs it.
+        # Only trials with a browser need it.
         from websockets.sync.client import connect  # noqa: PLC0415
 
         path = chromium()
@@ -95,7 +95,7 @@ class Chromium:
         Raises
         ------
         UserError
-            If the browser refuses, or says nothing.
+            If the browser refuses or does not answer.
         """
         number = self.post(method, session, **parameters)
         while True:
@@ -110,23 +110,23 @@ class Chromium:
         return dict(answer["result"])
 
     def post(self, method: str, session: str = "", **parameters: object) -> int:
-        """Send a command, and wait for nothing; return its number."""
+        """Send a command without waiting; return its number."""
         number = next(self._numbers)
         command = {"id": number, "method": method, "params": parameters}
         self._socket.send(json.dumps({**command, "sessionId": session} if session else command))
         return number
 
     def kill(self) -> None:
-        """End all of its processes at once."""
-        # Once only: later its number may be another's.
+        """Kill all of its processes at once."""
+        # Only once: the process number may be reused later.
         if self._process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
 
     def close(self) -> None:
-        """End it."""
-        # What has ended says no farewell that would be waited for.
+        """End the browser."""
+        # A browser that has ended does not answer: do not wait.
         self.kill()
         self._open.close()
 
@@ -143,19 +143,19 @@ class Chromium:
 
 
 class Tab:
-    """A page in it.
+    """A page of the browser.
 
     Parameters
     ----------
     browser : Chromium
-        Its browser.
+        Browser of the page.
     target, session : str
-        Names of the page and of the connection to it.
+        Identifiers of the page and of the connection to it.
 
     Attributes
     ----------
     target : str
-        Name of the page.
+        Identifier of the page.
     """
 
     def __init__(self, browser: Chromium, target: str, session: str) -> None:
@@ -164,48 +164,48 @@ class Tab:
         self._session = session
 
     def run(self, script: str) -> Any:
-        """Run a script; return what it comes to."""
+        """Run a script; return its result."""
         answer = self._browser.call(
             "Runtime.evaluate", self._session, expression=script, returnByValue=True
         )
         return answer["result"].get("value")
 
     def show(self) -> None:
-        """Bring it to the front."""
+        """Bring the page to the front."""
         self._browser.post("Target.activateTarget", targetId=self.target)
 
     def press_pointer(self, x: float, y: float) -> None:
-        """Press the mouse's button at a place [px]."""
+        """Press the mouse button at a position [px]."""
         self._mouse("mouseMoved", x, y, 0)
         self._mouse("mousePressed", x, y, 1)
 
     def release_pointer(self, x: float, y: float) -> None:
-        """Release it."""
+        """Release the mouse button."""
         self._mouse("mouseReleased", x, y, 0)
 
     def press_other_button(self, x: float, y: float) -> None:
-        """Press the mouse's other button beside the first."""
+        """Press the other mouse button in addition to the first."""
         self._mouse("mousePressed", x, y, 3, "right")
 
     def touch(self, *places: tuple[float, float]) -> None:
-        """Have fingers at these places [px]; nowhere: lift them."""
+        """Place fingers at these positions [px]; none: lift them."""
         points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(places)]
         self._input("Touch", type="touchStart" if points else "touchEnd", touchPoints=points)
 
     def cancel_touch(self) -> None:
-        """Take the fingers away as a system does that has use for them."""
+        """Cancel the touch, as a system does that uses it for itself."""
         self._input("Touch", type="touchCancel", touchPoints=[])
 
     def press_key(self, key: str) -> None:
-        """Press a key that is called as it is."""
+        """Press a key by its name."""
         self._input("Key", type="keyDown", key=key, code=key)
 
     def press_space(self, *, repeat: bool = False) -> None:
-        """Press the space bar, or say that it still is."""
+        """Press the space bar, or repeat it while it is pressed."""
         self._input("Key", type="keyDown", autoRepeat=repeat, **_KEY)
 
     def release_space(self) -> None:
-        """Release it."""
+        """Release the space bar."""
         self._input("Key", type="keyUp", **_KEY)
 
     def _mouse(self, kind: str, x: float, y: float, buttons: int, button: str = "left") -> None:

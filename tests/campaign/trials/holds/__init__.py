@@ -1,1 +1,1 @@
-"""Trials of what a person holds: a loss ends the motion, and nothing begins again by itself."""
+"""Trials of the hold: a loss ends the motion, and nothing resumes by itself."""

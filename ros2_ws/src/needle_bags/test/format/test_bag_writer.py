@@ -1,4 +1,4 @@
-"""Bags as rosbags and mcap read them; a recording that a disk refuses or is too slow for."""
+"""Bags as rosbags and mcap read them; recordings on a full, failing or slow disk."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def received(number: int = 1, topic: str = "/t") -> Received:
 
 @pytest.fixture(scope="module")
 def texts(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag of 200 texts with all that a bag can carry."""
+    """A bag of 200 texts that uses every feature of the format."""
     directory = tmp_path_factory.mktemp("writer") / "bag"
     bag = BagWriter(directory, chunk_size=4096)
     told: Any = {"reliability": QosReliability.BEST_EFFORT, "lifespan": QosTime(10, 7)}
@@ -106,10 +106,10 @@ class _BrokenFile(io.FileIO):
         raise OSError(errno.EIO, "Input/output error")
 
 
-def test_a_disk_that_refuses_data_is_an_error_at_the_start(
+def test_a_failing_disk_is_reported_at_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not after a run of which nothing was kept; and nothing stands in the way of the next try."""
+    """The error comes before the run, and the next attempt can use the same folder."""
     monkeypatch.setattr(BagWriter, "open_file", lambda _, path: _BrokenFile(path, "xb"))
     with pytest.raises(UserError, match=r"cannot record into .*bag: Input/output error"):
         open_recording(tmp_path / "bag")
@@ -121,10 +121,10 @@ def test_a_disk_that_refuses_data_is_an_error_at_the_start(
     open_recording(tmp_path / "bag").close()
 
 
-def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_an_error(
+def test_a_recording_ends_cleanly_before_a_full_disk_or_after_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The thread that writes may not end in silence: all that comes after would wait for ever."""
+    """The end of the writing thread must be reported, or later messages would wait forever."""
     strange = open_recording(tmp_path / "strange")
     strange.add_topic(TOPIC)
     for topic in ("/t", "/nobody_described_it", "/t"):
@@ -144,7 +144,7 @@ def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_an_error(
 
 
 class HeldWorker(list[Job]):
-    """A worker that does nothing before the end: its disk stands still."""
+    """Worker that runs no job before the end, like a stalled disk."""
 
     def __init__(self, do: RunJob, end: Job) -> None:
         self._do, self._end = do, end
@@ -161,7 +161,7 @@ class HeldWorker(list[Job]):
 
 
 def test_a_recording_keeps_room_for_small_messages_and_counts_dropped_ones(tmp_path: Path) -> None:
-    """Images fill the memory that there is, commands still get in."""
+    """Images fill the available memory; commands are still recorded."""
     limit = 1_000_000
     bag, space = BagWriter(tmp_path / "bag"), FreeSpace(tmp_path, 0)
     recording = Recording(bag, space, HeldWorker, waiting_limit=limit)
@@ -173,7 +173,7 @@ def test_a_recording_keeps_room_for_small_messages_and_counts_dropped_ones(tmp_p
         recording.append(received(topic="/command"))
     assert recording.bytes_waiting < 1.2 * limit
     assert recording.dropped.keys() == {"/image"}
-    # Tiny messages are bounded by what they take in memory.
+    # The bound on tiny messages includes their overhead in memory.
     for _ in range(1000):
         recording.append(Received("/command", b"", TIME, TIME))
     assert recording.bytes_waiting < 1.2 * limit
@@ -191,7 +191,7 @@ def test_health_reports_the_worst_problem() -> None:
     health = RecorderHealth(told, Path("bag"))
     assert health.check(0.5, {}, []) == (Level.OK, "recording")
     assert health.check(0.5, {}, ["/odd is not recorded"]) == (Level.WARN, "/odd is not recorded")
-    # 10 MB/s: 120 s of it do not fit.
+    # At 10 MB/s, 120 s of data exceed the free space.
     for _ in range(4):
         told.bytes_received += 5_000_000
         level, text = health.check(0.5, {}, [])

@@ -8,12 +8,12 @@ from needle_bags.format.message_loss import CERTAIN_AFTER, SequenceGaps
 @pytest.mark.parametrize(
     ("numbers", "missing"),
     [
-        ((7, 8, 9), 0),  # the recorder came late
+        ((7, 8, 9), 0),  # the recorder started late
         ((1, 3, 5), 2),
         ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 20), 9),
-        ((1, 2, 1001, 3), 0),  # a second publisher that was not announced
-        ((8, 9, 1, 2, 3), 0),  # the publisher was started anew
-        ((5, 6, 6, 7), 0),  # a repeat
+        ((1, 2, 1001, 3), 0),  # a second publisher that was not discovered
+        ((8, 9, 1, 2, 3), 0),  # the publisher was restarted
+        ((5, 6, 6, 7), 0),  # a duplicate
     ],
 )
 def test_gaps(numbers: tuple[int, ...], missing: int) -> None:

@@ -1,4 +1,4 @@
-"""A graph without DDS: rclpy's `Node` answers from memory, and time passes when it is spun."""
+"""A graph without DDS: rclpy's `Node` is served from memory, and time passes when it spins."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def type_name(kind: type) -> str:
 
 
 def sent(number: int, data: bytes = b"", time_ns: int = 1) -> Taken:
-    """Return what a subscription takes: a message, and what DDS knows of it."""
+    """Return what a subscription takes: a message and its DDS metadata."""
     names = ("source_timestamp", "received_timestamp")
     info = dict.fromkeys(names, time_ns) | {"publication_sequence_number": number}
     return data or str(number).encode(), info
 
 
 class PlayedSubscription:
-    """What waits for it is what a test has put there."""
+    """Subscription whose queue the test fills."""
 
     def __init__(self, topic: str, take: Callable[..., None], qos: QoSProfile, lost: Any) -> None:
         self.topic, self.take, self.qos_profile, self.lost = topic, take, qos, lost
@@ -42,17 +42,17 @@ class PlayedSubscription:
         self.handle = self
 
     def __enter__(self) -> None:
-        """Nothing has to be held."""
+        """Do nothing: there is no handle to hold."""
 
     def __exit__(self, *_: object) -> None:
-        """Nothing was held."""
+        """Do nothing."""
 
     def take_message(self, *_: object) -> Taken | None:
         return self.waiting.popleft() if self.waiting else None
 
 
 class PlayedClient:
-    """A client whose requests wait until the test has them answered."""
+    """Client whose requests wait until the test answers them."""
 
     def __init__(self, parameters: dict[str, dict[str, Any]], name: str) -> None:
         self.node, _, self.kind = name.rpartition("/")
@@ -72,7 +72,7 @@ class PlayedClient:
         self.pending = [one for one in self.pending if one[1] is not future]
 
     def answer(self, number: int = 0) -> None:
-        """Answer one of the requests that wait."""
+        """Answer one of the pending requests."""
         request, future = self.pending.pop(number)
         values = self.parameters[self.node]
         if self.kind == "list_parameters":
@@ -86,7 +86,7 @@ class PlayedClient:
 
 
 class PlayedGraph:
-    """What a node of ours sees of other nodes, and they of it."""
+    """Simulated graph around a node under test."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *modules: Any) -> None:
         self.now, self.name = 1000.0, "ours"
@@ -164,7 +164,7 @@ class PlayedGraph:
     def _timer(self, period: float, act: Act, **_: object) -> None:
         self._timers.append([self.now + period, period, act])
 
-    # ---- what others do
+    # ---- other nodes
 
     def offer(
         self, topic: str, kind: type, qos: QoSProfile = RELIABLE, node: str = "other"
@@ -180,7 +180,7 @@ class PlayedGraph:
         return Stub(qos_profile=qos, node_name=node, topic_type_hash=told)
 
     def send(self, topic: str, *messages: Any) -> None:
-        """Have every subscription of a topic get messages, or bytes."""
+        """Deliver messages, or bytes, to every subscription of a topic."""
         for message in messages:
             data = message if isinstance(message, bytes) else serialize_message(message)
             self._sent[topic] += 1
@@ -199,11 +199,11 @@ class PlayedGraph:
     # ---- time
 
     def at(self, time: float, act: Act) -> None:
-        """Plan something for so long from now [s]."""
+        """Schedule an action after a delay [s]."""
         self._plans.append((self.now + time, act))
 
     def run(self, seconds: float) -> None:
-        """Let time pass, with all timers and plans that are due."""
+        """Advance time, and run all timers and actions that are due."""
         self.now += seconds
         for plan in [p for p in self._plans if p[0] <= self.now]:
             self._plans.remove(plan)
@@ -214,7 +214,7 @@ class PlayedGraph:
                 timer[2]()
 
     def executor(self) -> Any:
-        """Return an executor whose turns take as long as they may."""
+        """Return an executor that spends the whole timeout of each turn."""
 
         def spin_once(timeout: float = 0.0, *, timeout_sec: float = 0.0) -> None:
             self.run(timeout + timeout_sec)

@@ -1,4 +1,4 @@
-"""Where one subscription replaces another nothing is lost or told twice; and what is asked for."""
+"""Replacement of subscriptions without loss or duplicates, and the requested QoS."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KEPT, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
 
 
 class Graph(PlayedGraph):
-    """Topics of a played graph, and the numbers that they gave."""
+    """Topics of a played graph, and the numbers received from them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__(monkeypatch, graph_topics)
@@ -40,7 +40,7 @@ class Graph(PlayedGraph):
             subscription.take(*sent(number))
 
     def replace(self, *heard: int) -> tuple[PlayedSubscription, PlayedSubscription]:
-        """Return a subscription, which has heard some, and the one that replaces it then."""
+        """Return a subscription that has received some numbers, and its replacement."""
         self.offer(JOINTS, Int32)
         self.topics.poll()
         self.hear(self.subscriptions[0], *heard)
@@ -107,7 +107,7 @@ def test_the_strictest_qos_of_all_publishers_is_requested(
     assert graph.asked() == (ALL, VOLATILE)
     graph.offer("/latched", Int32, BEST_EFFORT)
     assert graph.asked() == (SOME, VOLATILE)
-    # Who says one thing and ends would be missed; who takes best effort will get no more.
+    # Subscribe before the first publisher, which may send once and exit: use the subscribers' QoS.
     graph.request("/estop", Int32)
     assert graph.asked()[0] is ALL
     graph.request("/hold", Int32, BEST_EFFORT)

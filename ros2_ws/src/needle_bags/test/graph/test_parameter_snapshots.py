@@ -1,4 +1,4 @@
-"""Every node's parameters get into the bag, also where answers are lost or come late."""
+"""Parameters of every node are recorded, even if answers are lost or late."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OTHER, VALUES = "/rig/other", {"gain": 2.5, "names": ["a", "b"]}
 
 
 class Bench(PlayedGraph):
-    """A recorder, and another node that answers when the test wants."""
+    """Recorder, and another node that answers on demand."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__(monkeypatch, parameter_snapshots)
@@ -30,7 +30,7 @@ class Bench(PlayedGraph):
         self.snapshots.poll()
 
     def waits(self) -> None:
-        """Let the time pass after which it is asked again."""
+        """Advance time until the request is repeated."""
         self.now += parameter_snapshots.RETRY_AFTER
         self.snapshots.poll()
 

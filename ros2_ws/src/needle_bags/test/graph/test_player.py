@@ -1,4 +1,4 @@
-"""The player before a played graph: what it plays under which name when, and never to a rig."""
+"""The player in a played graph: topics, their names and times, and the protection of a rig."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ COUNT = 20
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twenty messages of each topic, a second apart; one is latched and comes at once."""
+    """Bag with twenty messages per topic, 1 s apart, and one latched message at the start."""
     path = tmp_path_factory.mktemp("player") / "bag"
     writer = BagWriter(path)
     numbers = {}
@@ -103,7 +103,7 @@ class Scene(PlayedGraph):
         return str(answer.message)
 
     def when(self, number: int, act: Callable[[], Any]) -> None:
-        """Do something right after a number was played, once."""
+        """Run an action once after a number was played."""
 
         def look() -> None:
             if number in self.numbers("/numbered"):
@@ -152,7 +152,7 @@ def test_part_of_a_bag_under_another_name_at_another_rate(scene: Scene) -> None:
     assert scene.numbers("/other") == list(range(2, 8))
     assert scene.offered() == {"/other", "/clock"}
     assert scene.now - begin == pytest.approx(node.DISCOVERY + 10.0, abs=0.2)
-    # The clock is that of recording, at 10 Hz of the wall's.
+    # /clock has the recorded time, at 10 Hz of wall time.
     stamps = [message.clock.sec for message in scene.heard["/clock"]]
     assert 80 < len(stamps) <= 101
     assert stamps[-1] - START // 10**9 == pytest.approx(7, abs=1)
@@ -160,7 +160,7 @@ def test_part_of_a_bag_under_another_name_at_another_rate(scene: Scene) -> None:
 
 def test_latched_messages_are_available_while_paused_and_loops_repeat(scene: Scene) -> None:
     def begin() -> None:
-        # The latched message lies before --start: who joins late gets it all the same.
+        # The latched message was recorded before --start, but late subscribers still receive it.
         assert len(scene.heard["/plane"]) == 1
         assert scene.heard["/numbered"] == []
         assert scene.pause(False) == "playing"
@@ -180,14 +180,14 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     scene.when(0, lambda: scene.change(seek=15.0))
     scene.when(15, lambda: scene.change(seek=4.0))
     scene.when(4, lambda: scene.change(seek=4.0))
-    # From 4 five seconds on; then a pause that takes no time of the bag's.
+    # At 5, jump forward by 5 s. The pause at 11 takes no time of the bag.
     scene.when(5, lambda: scene.pressed.append(FORWARD))
     scene.when(11, lambda: scene.pressed.append(PAUSE))
     scene.when(11, lambda: scene.at(10.0, lambda: scene.pressed.extend([PAUSE, FASTER])))
     assert scene.play("--regex ^/n|plane --exclude-regex noisy") == 0
     assert scene.numbers("/numbered") == [0, 15, 4, 4, 5, *range(11, COUNT)]
     assert scene.offered() == {"/numbered", "/plane", "/replay/target_plane"}
-    # At each jump the latched message is sent again, to who has joined.
+    # Each jump republishes the latched message for new subscribers.
     assert len(scene.heard["/plane"]) == 1 + 4
 
 
@@ -203,7 +203,7 @@ def test_beside_a_rig_everything_is_played_under_replay(scene: Scene) -> None:
 def test_a_rig_that_appears_ends_the_playback(
     scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # One of its own, replayed, is none.
+    # A replayed device status does not count as a rig.
     scene.offer("/replay/device/status", DiagnosticStatus, node="other_player")
     topic = "/bench/device/status"
     scene.when(3, lambda: scene.offer(topic, DiagnosticStatus, node="device_driver"))

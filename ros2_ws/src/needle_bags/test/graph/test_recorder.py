@@ -1,4 +1,4 @@
-"""The recorder before a played graph: what its bag holds, what it says, and how it ends."""
+"""The recorder in a played graph: content of the bag, reports, and the end."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ EVENTS, STATUS = "/parameter_events", "/bench/device/status"
 
 
 class AtOnce:
-    """A worker that does each job where it is put."""
+    """Worker that runs each job immediately."""
 
     waiting = 0
 
@@ -51,7 +51,7 @@ class AtOnce:
 
 
 class Scene(PlayedGraph):
-    """A recorder that begins and ends when the test says so."""
+    """Recorder that starts and stops under control of the test."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
         super().__init__(monkeypatch, node, graph_topics, parameter_snapshots)
@@ -66,7 +66,7 @@ class Scene(PlayedGraph):
         self._patch = partial(monkeypatch.setattr, node)
 
     def record(self, act: Callable[[], None], **settings: Any) -> int:
-        """Run the executable; `act` is what happens between its start and the signal."""
+        """Run the executable; call `act` between its start and the signal."""
         values = RecorderParameters(bag=str(self.bag), reserve=0, **settings)
         self._patch("NodeParameters", lambda *_: SimpleNamespace(values=values))
         ended = SimpleNamespace(requested=False)
@@ -85,7 +85,7 @@ class Scene(PlayedGraph):
         return node.main()
 
     def health(self, part: str) -> DiagnosticStatus:
-        """Return what it said last of a part."""
+        """Return the last reported status of a part."""
         told = [s for message in self.heard["/diagnostics"] for s in message.status]
         return [s for s in told if s.name == f"recorder: {part}"][-1]
 
@@ -119,7 +119,7 @@ def test_the_bag_has_all_messages_and_what_a_rerun_needs(
         scene.send(EVENTS, event)
         scene.offer("/rig/late", Int32, BEST_EFFORT)
         scene.run(0.1)
-        # What comes after the signal is waited for.
+        # Messages that arrive shortly after the signal are recorded, too.
         scene.at(0.1, lambda: scene.send("/rig/late", Int32(data=1)))
         scene.at(0.35, lambda: scene.send("/rig/late", Int32(data=2)))
 
@@ -157,10 +157,10 @@ def test_a_full_disk_ends_the_recording_and_not_the_node(
     def act() -> None:
         scene.send("/numbered", *(Int32(data=number) for number in range(5)))
         scene.run(0.2)
-        # The first of these has all before it written out, the second meets the full disk.
+        # The first of these flushes all earlier ones; the second meets the full disk.
         scene.send("/numbered", *(Int32(data=number) for number in range(5, 9)))
         scene.run(0.5)
-        # It listens to nothing more.
+        # All subscriptions have ended.
         assert scene.subscriptions == []
         scene.run(0.5)
 
@@ -190,7 +190,7 @@ def test_snapshots_on_request_and_a_second_after_a_fault(scene: Scene) -> None:
     def act() -> None:
         scene.send("/plane", Int32(data=7))
         say("HOLDING")
-        # More than fits: the first go, the latched ones stay.
+        # More than the limit: the oldest messages are dropped, latched ones stay.
         scene.send("/numbered", *(Int32(data=number) for number in range(1400)))
         scene.run(0.5)
         assert not int({p.key: p.value for p in scene.health("bag").values}["messages"])
@@ -200,7 +200,7 @@ def test_snapshots_on_request_and_a_second_after_a_fault(scene: Scene) -> None:
         scene.run(0.9)
         scene.send("/numbered", Int32(data=-2))
         scene.run(0.5)
-        # No fault is left to be told.
+        # The same fault again causes no snapshot.
         scene.send("/numbered", Int32(data=-3))
         say("FAULT")
 
@@ -227,7 +227,7 @@ def test_topic_selection_and_invalid_parameters() -> None:
             RecorderParameters(**{name: value})
 
 
-def test_a_recorder_that_cannot_start_leaves_a_bag_that_is_whole(
+def test_a_recorder_that_cannot_start_leaves_a_complete_bag(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> None:

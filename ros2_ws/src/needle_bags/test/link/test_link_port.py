@@ -1,4 +1,4 @@
-"""The port that says the same to all: whatever they send, and however slowly they read."""
+"""Port that sends the same to all clients, whatever they send and however slowly they read."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from needle_bags.link.link_port import LinkPort
 from needle_core.errors import UserError
 from needle_core.openigtlink import LinkMessage
 
-# A message of 2^64 bytes, of which none comes; another protocol; noise.
+# A message with a length of 2^64 bytes and no body; another protocol; noise.
 HEADER = struct.pack("> H 12s 20s II Q Q", 1, b"TRANSFORM", b"\xfe" * 20, 0, 0, 2**64 - 1, 0)
 GARBAGE = (HEADER, b"GET / HTTP/1.1\r\n\r\n", random.Random(1).randbytes(100_000))
 
@@ -47,7 +47,7 @@ def test_all_clients_receive_the_same_whatever_another_sends(server: LinkPort) -
                 server.exchange(b"")
                 server.exchange(b"needle")
                 assert read(good, 6) == read(bad, 6) == b"needle"
-                # Half a message, then gone: with a reset.
+                # Half a message, then a connection reset.
                 bad.sendall(garbage[:7])
                 bad.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             while server.listeners.count == 2:
@@ -64,7 +64,7 @@ def test_messages_arrive_and_garbage_of_one_client_ends_its_input_only(server: L
         found: list[LinkMessage] = []
         for client, data in ((bad, b"GET / HTTP/1.1\r\n" + bytes(58)), (good, text), (bad, text)):
             client.sendall(data)
-        # The order in which the kernel delivers is not that of the sockets.
+        # The kernel may deliver out of order across sockets.
         while not (found and server.listeners.problems):
             found += server.exchange(b"")
         assert found == [LinkMessage(1, "POINT", "target", 0.0, b"abc")]

@@ -1,4 +1,4 @@
-"""openigtlink: packs with pyigtl, which is an extra and played here, and proposes targets."""
+"""openigtlink with a simulated pyigtl (an extra): packed messages and proposed targets."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ Said = dict[str, tuple[Any, float]]
 
 
 class Played:
-    """A message of pyigtl's: its content, time and device name; of points, their names, too."""
+    """Stand-in for a pyigtl message: content, time and device name; for points also their names."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
-        # Of a POLYDATA, the first is the points and the second the lines.
+        # A POLYDATA has the points first, then the lines.
         content, *_, time, name = (*given, *named.values())
         self._said = [name, np.asarray(content).tolist(), time]
 
@@ -47,7 +47,7 @@ class Played:
 
 @pytest.fixture
 def component(monkeypatch: pytest.MonkeyPatch) -> OpenIGTLink:
-    """The component, whom somebody listens to."""
+    """The component with a connected client."""
     names = ("StringMessage", "TransformMessage", "PointMessage", "PolyDataMessage")
     kinds = dict.fromkeys(names, Played)
     played: Any = SimpleNamespace(**kinds)
@@ -83,7 +83,7 @@ def test_messages_are_in_mm(component: OpenIGTLink) -> None:
     hear(component, "needle/controller_status", status)
     hear(component, "joint_states", m.JointState(1, ("insertion_joint",), (0.04,)))
     hear(component, "needle/tip_pose", pose(5_250_000_000))
-    # In the frame of the plane, 3 mm beside.
+    # In the frame of the plane, offset by 3 mm.
     hear(component, "needle/estimate", pose(5_250_000_000))
     said = says(component)
     assert said["NeedleStatus"][0] == "tip found"
@@ -111,7 +111,7 @@ def test_messages_are_in_mm(component: OpenIGTLink) -> None:
     hear(component, "needle/planned_path", path)
     plan = np.array(says(component)["NeedlePlan"][0])
     np.testing.assert_allclose(plan, [[10.0, 0.0, 80.0], [10.0, 0.0, 100.0]])
-    # A tip that is not seen any longer is not shown.
+    # A lost tip is not shown.
     for unseen in (
         pose(2_000_000_000, np.inf),
         m.PoseWithCovariance(2, "rig", TIP, (0.0,) * 4, (0.0,) * 36),
@@ -140,7 +140,7 @@ def test_the_port_reports_clients_and_without_any_nothing_is_packed() -> None:
         assert arrived == [(log,), (Listeners(0),)]
 
 
-# Name of the message, its points in mm, and the proposed target in mm or the warning.
+# Message name, its points in mm, and the proposed target in mm or the warning.
 POINTS: tuple[tuple[str, tuple[tuple[str, Any], ...], Any], ...] = (
     ("Plan", (("Target-1", (10.0, -5.0, 100.0)), ("Entry-1", (0.1, 0.2, 0.3))), (10, -5, 100)),
     ("TARGET_POINT-1", (("F-1", (10.0, -5.0, 100.0)),), (10, -5, 100)),
@@ -163,7 +163,7 @@ POINTS: tuple[tuple[str, tuple[tuple[str, Any], ...], Any], ...] = (
 def test_a_planners_target_is_proposed(name: str, points: Any, expected: Any, version: int) -> None:
     body = b"".join(point_body(label, *at) for label, at in points)
     if version == 2:
-        # An extended header, and one pair of metadata.
+        # An extended header with one metadata pair.
         head = struct.pack(">HHII", 12, 10, 4, 7)
         body = head + body + struct.pack(">HHHI", 1, 1, 3, 3) + b"kval"
     if version == 3:
@@ -217,12 +217,12 @@ def test_messages_are_split_at_any_byte() -> None:
         assert not stream.problem
         assert not list(stream.split(packed_message("POINT", "t", b"", version=7)))
         assert "version 7" in stream.problem
-        # It is ignored from there on.
+        # The rest of the input is ignored.
         assert not list(stream.split(data))
 
 
 def point_body(name: str, x: float, y: float, z: float) -> bytes:
-    """Return a point as in http://openigtlink.org/protocols/v2_point.html."""
+    """Return a point as defined in http://openigtlink.org/protocols/v2_point.html."""
     text = (name.encode(), b"group", 255, 0, 0, 255, x, y, z, 1.0, b"owner")
     return struct.pack(">64s32s4B4f20s", *text)
 

@@ -1,4 +1,4 @@
-"""What is drawn of a needle: shaft and way, belief in `rig`, uncertainty, images in their turn."""
+"""Drawing of a needle: shaft and path, estimate in `rig`, uncertainty, images with answers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def arc(insertion: float) -> NDArray[np.float64]:
-    """Where the tip of a needle on a circle is."""
+    """Tip positions of a needle on a circle."""
     angle = insertion / RADIUS
     return RADIUS * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)])
 
@@ -61,7 +61,7 @@ def test_the_ellipsoid_contains_95_percent() -> None:
     for turned in Rotation.random(4, random_state=5).as_matrix():
         covariance = turned @ np.diag([1e-8, 4e-8, 9e-6]) @ turned.T
         axes, lengths = ellipsoid(covariance)
-        # Else no quaternion would turn them.
+        # A quaternion needs a right-handed frame.
         assert np.linalg.det(axes) == pytest.approx(1.0)
         drawn = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
         inside = np.sum((drawn @ axes / lengths) ** 2, axis=1) <= 1.0
@@ -119,7 +119,7 @@ def pose(insertion: float) -> NDArray[np.float64]:
 
 
 def steered(insertion: float, *, estimated_to: float) -> Any:
-    """Return a needle whose measured tips are 1 mm aside, and whose estimates are on the circle."""
+    """Return a needle with measured tips 1 mm beside the circle, and estimates on it."""
     needle: Any = LiveNeedle()
     needle.set_targets(0.0, None)
     for number in range(round(insertion / STEP) + 1):
@@ -148,7 +148,7 @@ def test_the_end_of_a_withdrawn_needle_is_measured() -> None:
     assert stamp == 99
     np.testing.assert_allclose(poses[:-1], [pose(number * STEP) for number in range(30)], atol=1e-9)
     assert poses[-1, :3, 3] == pytest.approx(arc(0.033))
-    # Neither an estimate there nor a tip: its shape is unknown.
+    # Neither an estimate nor a tip exists there: the shape is unknown.
     needle.add_missing_tip(100)
     assert needle.shape is None
 
@@ -179,11 +179,11 @@ def test_an_image_is_shown_once_with_its_answer_or_late_without() -> None:
     assert drawn(20, 0.2) is None
     assert drawn(10, 0.2) is None
     assert drawn(30, 0.3) == (30, True)
-    # One that waits for its answer is not drawn without, so soon after the last.
+    # Soon after the last image, the next one still waits for its answer.
     images.add(40, blank(40))
     assert drawn(30, 0.7) is None
     assert drawn(30, 0.9) == (40, False)
-    # Without answers the newest is drawn as it is.
+    # Without answers, the newest image is drawn as it is.
     images = LatestImages()
     images.add(10, blank(10))
     assert drawn(None, 5.0) is None

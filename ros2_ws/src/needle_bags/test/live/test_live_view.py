@@ -1,4 +1,4 @@
-"""live_view on virtual time, before a rig that the test plays and viewers that come and go."""
+"""live_view in virtual time, with a rig played by the test and viewers that come and go."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ EXPOSED = 5_000_000_000
 
 
 class PlayedRig(Component):
-    """Says what the test wants."""
+    """Component that publishes messages of the test."""
 
     name = "played_rig"
 
@@ -56,7 +56,7 @@ class PlayedRig(Component):
 
 
 class Viewer(Component):
-    """Looks at some topics of the live view."""
+    """Viewer that subscribes to some topics of the live view."""
 
     name = "viewer"
 
@@ -126,13 +126,13 @@ def inserted(insertion: float) -> m.JointState:
 
 
 def steered() -> Scene:
-    """Return a scene with a tip that is seen, an estimate, a plane and a point."""
+    """Return a scene with a detected tip, an estimate, a plane and a point."""
     scene = Scene()
     scene.say("joint_states", inserted(0.04))
     status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
     scene.say("needle/controller_status", status)
     scene.say("needle/tip_pose", pose("rig", 1e-4))
-    # In the frame of the plane, 3 mm beside.
+    # In the frame of the plane, offset by 3 mm.
     scene.say("needle/estimate", pose("target_plane", 2e-4))
     return scene
 
@@ -163,7 +163,7 @@ def test_known_quantities_are_drawn_and_the_others_deleted() -> None:
     there = shown(markers[-1])
     assert there["estimate"].points[0] == pytest.approx((TIP[0] + 0.003, *TIP[1:]))
     assert there["uncertainty"].scale == pytest.approx((4 * 2.7955e-4,) * 3)
-    # What is not found is grey.
+    # A tip that was not found is grey.
     scene.say("needle/tip_pose", pose("rig", np.inf, 2 * EXPOSED))
     assert shown(markers[-1])["tip"].colour == (0.7, 0.7, 0.7, 1.0)
 
@@ -178,12 +178,12 @@ def test_topics_without_subscriber_are_not_published() -> None:
     scene.published.clear()
     scene.runner.run(0.5)
     assert scene.published == []
-    # Nor are images received.
+    # Images are not received either.
     peers, at = Peers(subscribers={LEFT: ("viewer",)}), Moment(0.0, 0)
     assert list(scene.view.on_peers(peers, at)) == [Listen(RAW, True), Listen(RAW_RIGHT, False)]
     assert list(scene.view.on_peers(Peers(), at)) == [Listen(RAW, False), Listen(RAW_RIGHT, False)]
     assert {row.topic for row in scene.view.inputs if row.lazy} == {RAW, RAW_RIGHT}
-    # Without a message for transforms there is no topic of them.
+    # Without the message type for transforms, the topic does not exist.
     topics = {live_view.TIP, live_view.PATH, live_view.MARKERS, *live_view.PICTURES.values()}
     topics.add(live_view.ROBOT_DESCRIPTION)
     assert {row.topic for row in scene.view.outputs} == topics
@@ -210,7 +210,7 @@ def test_implausible_messages_are_rejected() -> None:
         assert after["estimate"].points == before["estimate"].points
         assert after["shaft"].points == before["shaft"].points
         assert after.keys() == before.keys()
-    # Health is told again after a good message.
+    # Health recovers with a good message.
     scene.say("joint_states", inserted(0.04))
     assert scene.health["joint_states"] == "ok"
 
@@ -220,7 +220,7 @@ def test_implausible_messages_are_rejected() -> None:
 
 @pytest.fixture(scope="module")
 def left_view() -> Projection:
-    """What the left camera sees; compiled."""
+    """Compiled projection of the left camera."""
     project = stereo_views(load_calibration(CALIBRATION))[0].project
     project(np.array(TIP))
     return project
@@ -258,7 +258,7 @@ def test_images_of_another_camera_or_before_a_subscription_are_not_shown() -> No
     first = Viewer(scene.view, [LEFT])
     scene.runner.start(first)
     scene.runner.run(0.25)
-    # It waits for its answer, which takes longer than anybody looks.
+    # It still waits for its answer when the viewer leaves.
     scene.rig.todo.append(Publish(RAW, black(2)))
     scene.runner.run(0.05)
     scene.runner.stop("viewer")
@@ -283,7 +283,7 @@ def test_transforms_are_published_if_the_message_type_is_installed() -> None:
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
     seen = scene.look_at(live_view.TF, live_view.TF_STATIC).seen
     assert len(seen[live_view.TF_STATIC]) == 1
-    # Before anything is known there is nothing to be sent.
+    # Nothing is sent before there is data.
     assert seen[live_view.TF] == []
     scene.say("needle/controller_status", ControllerStatus(target_offset_m=0.003))
     scene.say("needle/tip_pose", pose("rig", 1e-4))
@@ -323,12 +323,12 @@ def test_clients_receive_watched_topics_and_latched_ones_alone(left_view: Projec
     clients.todo.append(Send(FOXGLOVE, (Watched(frozenset()),)))
     scene.runner.run(0.1)
     assert tell() == latched
-    # Images are received for clients alone, too.
+    # Images are also received if only clients of the port request them.
     (port,) = scene.view.ports
     for topics in ({LEFT}, set()):
         actions = list(port.handler([Watched(frozenset(topics))], Moment(0.0, 0)))
         assert actions == [Listen(RAW, LEFT in topics), Listen(RAW_RIGHT, False)]
-    # Without the port it receives nothing in vain.
+    # Without the port, unneeded topics are not received.
     plain = Scene().view
     assert plain.ports == ()
     assert "needle/reduced_state" not in {row.topic for row in plain.inputs}

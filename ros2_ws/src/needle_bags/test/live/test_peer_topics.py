@@ -100,7 +100,7 @@ STAGE: dict[str, Any] = {
     "translation": (0.1, 0.02, 0.03),
     "rotation": (-0.5, -0.5, -0.5, 0.5),
 }
-# Of a point x, y, z in rig: y, z, x, and the translation, in mm.
+# A point (x, y, z) in rig becomes (y, z, x) plus the translation, in mm.
 STAGE_TARGET = (100.0 - 5.0, 20.0 + 100.0, 30.0 + 10.0)
 
 

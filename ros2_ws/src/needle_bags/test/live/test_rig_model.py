@@ -1,4 +1,4 @@
-"""The URDF as pytransform3d reads it, the calibration and the published frames: they agree."""
+"""Agreement of the URDF as read by pytransform3d, the calibration and the published frames."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_published_transforms_are_those_of_the_urdf(calibration: StereoCalibrati
         pose = transform_from_pq([*one.translation, w, x, y, z])
         wanted = rig.get_transform(one.child_frame_id, one.frame_id)
         np.testing.assert_allclose(pose, wanted, atol=1e-10)
-    # Each link of the URDF but its root has one parent, the same.
+    # Each link of the URDF except the root has the same single parent.
     links = {one.child_frame_id: one.frame_id for one in published}
     attributes = joint_attributes(rig_urdf(calibration, LIMITS, 0.0009))
     names = {name.split()[0] for name in attributes}
@@ -102,6 +102,6 @@ def test_published_transforms_are_those_of_the_urdf(calibration: StereoCalibrati
 
 
 @pytest.mark.parametrize("text", ["", "<robot>", "<robot><joint type='fixed'/></robot>"])
-def test_another_file_is_no_urdf(text: str) -> None:
+def test_other_files_are_rejected_as_urdf(text: str) -> None:
     with pytest.raises(UserError, match="not a URDF: "):
         joint_attributes(text)

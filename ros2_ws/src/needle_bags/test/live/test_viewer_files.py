@@ -1,4 +1,4 @@
-"""The files by which viewers show what live_view sends."""
+"""Configuration files of viewers for the topics of live_view."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RVIZ = {
 
 
 def published() -> dict[str, str]:
-    """Return topic to type of all that live_view publishes, and of what a recorded graph did."""
+    """Return the type of each topic that live_view or a recorded graph publishes."""
     metadata = yaml.safe_load((ROOT / "bags/regression/metadata.yaml").read_text("utf-8"))
     topics = metadata["rosbag2_bagfile_information"]["topics_with_message_count"]
     recorded = [one["topic_metadata"] for one in topics]

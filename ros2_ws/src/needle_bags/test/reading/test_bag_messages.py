@@ -17,7 +17,7 @@ QUESTIONS, ANSWERS, LARGE = "/questions", "/answers", "/large"
 
 
 def write(directory: Path, delay_of: Callable[[str, int], int], *, count: int = 30) -> None:
-    """Questions and answers 1 ms apart, each received by its topic's delay later."""
+    """Write questions and answers 1 ms apart, each received after the delay of its topic."""
     bag = BagWriter(directory)
     for name, kind in ((QUESTIONS, TYPE), (ANSWERS, TYPE), (LARGE, IMAGE)):
         bag.add_topic(standard_topic(name, kind))
@@ -47,7 +47,7 @@ def test_a_late_question_still_comes_before_its_answer(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("skew", [-20 * MILLISECOND, 5_000 * MILLISECOND])
 def test_with_another_clock_the_order_of_reception_is_kept(tmp_path: Path, skew: int) -> None:
-    """The answerer's clock is off: its messages were received when they were, not when it says."""
+    """The answerer's clock is wrong: messages are ordered by reception, not by their stamps."""
     write(tmp_path / "bag", lambda topic, _: skew if topic == ANSWERS else 0)
     received = [m.log_time for m in raw_as_sent(tmp_path / "bag", lambda _: True)]
     assert received == sorted(received)

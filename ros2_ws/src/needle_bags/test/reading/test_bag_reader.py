@@ -26,7 +26,7 @@ def test_a_namespace_is_found(make_run: MakeRun) -> None:
 
 @pytest.fixture
 def two_rigs(make_run: MakeRun, tmp_path: Path) -> Path:
-    """A bag of a rig without a namespace, and of a shorter run of one in /bench."""
+    """A bag of a rig without a namespace and of a shorter run of one in /bench."""
     copy = BagCopy(tmp_path / "two", "jazzy", {})
     for bag in (make_run("one", steps=30), make_run("other", namespace="/bench/", steps=20)):
         contents = read_contents(bag)
@@ -99,7 +99,7 @@ def other_type(path: Path) -> None:
 
 
 def other_distribution(path: Path) -> None:
-    """A PointStamped without `point`: by its own definition it can be read, as a tip it cannot."""
+    """Write a PointStamped without `point`: readable by its own definition, but not as a tip."""
     bag = BagWriter(path, distribution="humble")
     kinds = (
         ("/needle/controller_status", "diagnostic_msgs/msg/DiagnosticStatus"),
@@ -119,7 +119,7 @@ def other_distribution(path: Path) -> None:
         (other_distribution, r"as ROS 2 Jazzy has it \(bag of humble"),
     ],
 )
-def test_a_bag_without_a_readable_run_is_one_line(
+def test_a_bag_without_a_readable_run_gives_a_one_line_error(
     tmp_path: Path, make: Callable[[Path], None], words: str
 ) -> None:
     make(tmp_path / "bag")

@@ -1,4 +1,4 @@
-"""Bags as frames: the rows beside what the typed reader reads of the same bag."""
+"""Bags as data frames, compared with the typed reader."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ POSE = [f"position.{axis}" for axis in "xyz"] + [f"orientation.{axis}" for axis 
 
 @pytest.fixture(scope="module")
 def rows() -> dict[str, list[dict[str, Any]]]:
-    """What a bag has for pandas, which is an extra."""
+    """Rows of a bag as passed to pandas, which is an extra."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "pandas", SimpleNamespace())
         patch.setattr(frames, "_frame", lambda _, found: found)
@@ -48,7 +48,7 @@ def test_rows_agree_with_the_typed_reader(rows: dict[str, list[dict[str, Any]]])
     }
     for topic, (series, columns) in wanted.items():
         found = table(topic, ["stamp", "received", *columns])
-        # The typed reader keeps the first of equal stamps, and their order.
+        # The typed reader keeps only the first of several equal stamps.
         _, first = np.unique(found[:, 0], return_index=True)
         np.testing.assert_allclose(found[first, 0], series.stamps * 1e-9, rtol=0, atol=1e-9)
         np.testing.assert_allclose(found[first, 1], series.received * 1e-9, rtol=1e-12)
@@ -59,12 +59,12 @@ def test_rows_agree_with_the_typed_reader(rows: dict[str, list[dict[str, Any]]])
     )
     last, status = run.controller_status[-1].values, rows["/needle/controller_status"][-1]
     assert {f"values.{key}": value for key, value in last.items()}.items() <= status.items()
-    # Without a header its time is that of its arrival.
+    # A message without header has its time of arrival.
     assert status["stamp"] == status["received"]
     assert [result.outcome for result in run.results] == [
         row["frame_id"] for row in rows["/device/result"]
     ]
-    # Of a picture there is no table, and of a type's constants no column.
+    # Images have no table, and constants of a type have no column.
     assert set(rows) == {topic for topic in run.topics if "image" not in topic}
     assert "OK" not in status
 

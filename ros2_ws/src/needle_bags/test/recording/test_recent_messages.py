@@ -21,7 +21,7 @@ def test_the_last_seconds_are_kept() -> None:
     assert recent.memory == 0
 
 
-def test_memory_bounds_them_too() -> None:
+def test_memory_of_recent_messages_is_bounded() -> None:
     limit = 50_000
     recent = RecentMessages(1e3, limit)
     for second in range(200):
@@ -32,7 +32,7 @@ def test_memory_bounds_them_too() -> None:
     assert kept[-1].log_time == 199 * SECOND
 
 
-def test_the_last_of_a_latched_topic_stays_once() -> None:
+def test_the_last_latched_message_is_kept_once() -> None:
     recent = RecentMessages(1.0, 10**9)
     recent.latch("/plane")
     for seconds in (0.0, 0.1):

@@ -1,4 +1,4 @@
-"""A worker does its jobs in order, looks when it is time to, and ends after the last."""
+"""Worker: jobs in order, periodic wake-ups, and an end after the last job."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_jobs_run_in_order_with_periodic_wake_ups() -> None:
         job()
         if job is no_op:
             looked.put(job)
-        return 0.0  # it wants to be called at once
+        return 0.0  # request the next wake-up immediately
 
     worker = WorkerThread(do, lambda: done.append("end"))
     for _ in range(3):
@@ -26,7 +26,7 @@ def test_jobs_run_in_order_with_periodic_wake_ups() -> None:
     worker.finish()
     assert done == [*names, "end"]
     assert not worker.waiting
-    # Asked for again it has nothing to do.
+    # A second call has no effect.
     worker.finish()
     assert done[-2:] == [names[-1], "end"]
 

@@ -1,4 +1,4 @@
-"""Bags of numbered messages, one every 10 ms; mcap's and rosbags' readers say what is in them."""
+"""Bags of numbered messages, 10 ms apart, read with mcap and rosbags."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RUN = {"commit": "0123abc", "run_info": "seed: 3"}
 
 @functools.cache
 def payload(number: int) -> bytes:
-    """A message that tells its number and ends in no zero, as a power cut's zeros do."""
+    """Return a message with its number that does not end in 0, unlike zeros after a power cut."""
     content = np.frombuffer(np.random.default_rng(number).bytes(100) + b"\x01", np.uint8)
     layout = STORE.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=number)
     return bytes(STORE.serialize_cdr(STORE.types[TYPE](layout=layout, data=content), TYPE))
@@ -52,7 +52,7 @@ def write(
     run: dict[str, str] | None = None,
     **how: int | str,
 ) -> Path:
-    """Our recorder's bag, of chunks of some 30 messages, with what it leaves in the data."""
+    """Write a bag as our recorder does, in chunks of about 30 messages."""
     bag = BagWriter(path, **{"chunk_size": 4096, **how})  # type: ignore[arg-type]
     topics = [bag.add_topic(topic) for topic in TOPICS]
     run = RUN if run is None else run
@@ -73,7 +73,7 @@ def write(
 
 
 def kill(path: Path, share: float = 0.75) -> Path:
-    """Leave what a killed recorder leaves: no metadata.yaml, no index, half a chunk."""
+    """Leave a bag as a killed recorder does: no metadata.yaml, no index, half a chunk."""
     (path / "metadata.yaml").unlink()
     file = max(path.glob("*.mcap"))
     data = file.read_bytes()
@@ -82,7 +82,7 @@ def kill(path: Path, share: float = 0.75) -> Path:
 
 
 def damage(file: Path, share: float = 0.5) -> int:
-    """Change a byte of a message in a file; return the message's number."""
+    """Change a byte of a message in a file; return the number of the message."""
     data = file.read_bytes()
     found = {data.find(payload(number)): number for number in range(300)}
     place = min(at for at in found if at > len(data) * share)
@@ -95,7 +95,7 @@ def contents(path: Path) -> dict[str, bytes]:
 
 
 def numbers(path: Path) -> list[int]:
-    """The numbers of a whole bag's messages, as all readers see them."""
+    """Return the message numbers of a whole bag; all readers must agree on them."""
     with Reader(path) as reader:
         found = [bytes(data) for _, _, data in reader.messages()]
         assert reader.message_count == len(found)

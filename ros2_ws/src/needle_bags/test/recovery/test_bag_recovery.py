@@ -1,4 +1,4 @@
-"""`recover` makes bags whole, says what was lost, and changes nothing where it cannot."""
+"""`recover` repairs bags, reports the loss, and changes nothing if it fails."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_without_metadata_everything_is_recovered_in_order(tmp_path: Path) -> No
             document["rosbag2_bagfile_information"]["custom_data"].pop(key, None)
     assert after == before
     assert numbers(path) == list(range(300))
-    # The same where there is no sense in it.
+    # The same with malformed or empty metadata.
     for text in ("rosbag2_bagfile_information: [1, {", ""):
         (path / "metadata.yaml").write_text(text)
         (kept,) = recover_bag(path).kept
@@ -162,7 +162,7 @@ def test_without_room_for_a_copy_nothing_is_changed(tmp_path: Path) -> None:
 
 
 class Interruption(Exception):
-    """Stands in for a kill: nothing is tidied after it."""
+    """Stand-in for a kill: nothing is cleaned up."""
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_an_interrupted_recovery_can_be_repeated(
     shutil.copytree(path, tmp_path / "other" / "bag")
     wanted = recover_bag(tmp_path / "other" / "bag")
     act = getattr(bag_recovery, step)
-    # Interrupted before its first, second, ... call.
+    # Interrupt the first, second, ... call.
     for calls in range(100):
         left = [act] * calls
         shutil.rmtree(path)

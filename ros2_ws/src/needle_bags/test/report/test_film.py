@@ -51,7 +51,7 @@ def test_frames_are_equally_spaced_and_end_at_their_tip(made_up: Run) -> None:
         assert np.array_equal(frame.needle[-1], made_up.truth.values[here, :3][0])
         tip = made_up.tips.values[made_up.tips.stamps == frame.stamp][0]
         assert np.array_equal(frame.shaft[-1], tip)
-        # Without truth the measured one is shown.
+        # Without ground truth, the measured tip is shown.
         assert np.array_equal(seen.needle, frame.shaft)
 
 
@@ -61,7 +61,7 @@ def test_a_resting_needle_takes_no_frames(made_up: Run) -> None:
     insertions = run.insertion_at(np.array([frame.stamp for frame in frames]))
     assert insertions.max() <= 0.1 + 1e-9
     assert len(frames) > MAX_FRAMES // 2
-    # Drawn out again: that is part of the film.
+    # A withdrawal is part of the film.
     there_and_back = 0.06 - np.abs(made_up.joints.values[:, 0] - 0.06)
     assert film_of(with_depth(made_up, there_and_back))[-1].stamp == made_up.tips.stamps[-1]
 
@@ -80,7 +80,7 @@ def test_the_drawings_are_to_scale(made_up: Run) -> None:
     true = np.array([frame.needle[-1] for frame in frames])
     for view, axis in ((side, 0), (above, 1)):
         ends = np.array([line[-1] for line in view.lines])
-        # To the right with depth, upwards with x or y; straight in both.
+        # Depth points right, x or y upwards; both are linear.
         for pixels, metres, sign in ((ends[:, 0], true[:, 2], 1), (ends[:, 1], true[:, axis], -1)):
             slope, offset = np.polyfit(metres, pixels, 1)
             assert np.sign(slope) == sign
@@ -92,13 +92,13 @@ def test_the_drawings_are_to_scale(made_up: Run) -> None:
 def test_the_film_has_the_images_in_order(make_run: Callable[..., Path]) -> None:
     run = read_run(make_run(image_height=3, steps=60, bad_tip=30))
     frames = film_of(run)
-    # A tip that is not a number is no needle.
+    # A NaN tip draws no needle.
     assert [len(frames[k].shaft) > 0 for k in (29, 30, 31)] == [True, False, True]
     views = camera_views(run, frames)
     assert len(views) == 2
     for view in views:
         shades = [np.median(decoded(data)) for data in view.pictures]
-        # The made-up images are as bright as their number.
+        # The brightness of a made-up image is its number.
         assert np.abs(np.array(shades) - np.arange(MAX_FRAMES)).max() <= 2.0
 
 
@@ -121,7 +121,7 @@ def test_the_film_marks_the_tip_in_camera_images(
             assert (u, v) == pytest.approx(measured.tolist(), abs=0.051)
             image = images[index, side]
             near = image[int(v) - 6 : int(v) + 7, int(u) - 6 : int(u) + 7]
-            # The steel is darker than what is around it.
+            # The steel is darker than its surroundings.
             assert near.min() < np.median(image[int(v) - 40 : int(v) + 41, int(u) : int(u) + 41])
             checked += 1
     assert checked == 12

@@ -1,4 +1,4 @@
-"""One page for a bag, or for two; what it says is what the run was."""
+"""Report page of one or two bags: its content agrees with the runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ COMMAND = "scripts/simulate --level=tip --params='a <file>.yaml'"
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The figures of a report, which are not rendered."""
+    """Collect the figures of a report without rendering them."""
     figures: list[Figure] = []
     dot = report._png(Figure(figsize=(0.1, 0.1)))
 
@@ -43,7 +43,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
 
 def assert_leads_nowhere_else(page: str) -> None:
-    """No reference to another file or place, and each within the page to something there."""
+    """Check that the page refers to no other file or site, and that its internal links resolve."""
     assert not re.search(r"(src|href)=.(?!data:|#)", page)
     assert not re.search(r"url\(|@import|//[\w-]+\.\w", re.sub(r"base64,[\w+/=]+", "", page))
     names = re.findall(r' id="([^"]+)"', page)
@@ -54,7 +54,7 @@ def assert_leads_nowhere_else(page: str) -> None:
 def test_the_report_is_one_self_contained_file(reported: tuple[Run, str]) -> None:
     run, page = reported
     assert_leads_nowhere_else(page)
-    # Two drawings of the film beside the figures, which are files, too.
+    # Two drawings of the film and the figures, which are also files.
     figures = ("states", "path", "errors", "timing", "events")
     assert page.count("data:image/png;base64,") == len(figures) + 2
     for name in figures:
@@ -122,12 +122,12 @@ def test_the_report_of_a_rerun(make_run: MakeRun, tmp_path: Path, drawn: list[Fi
     assert words == "Rerun"
     assert "come from steered, steered by paper" in sentence
     assert "those that best would have sent" in sentence
-    # The command is that of the run in which the needle went in.
+    # The command belongs to the run in which the needle was inserted.
     assert "command" not in rerun.run_info
     third = tmp_path / "third"
     write_rerun(rerun, third, [], {"/plane_controller": {"preset": "open_loop"}}, "")
     assert summarize(read_run(third))["steered_by"] == "paper"
-    # Both in one page: one needle, and what each commanded, or only would have.
+    # Both on one page: one needle, the commands of the run, and those of the rerun.
     assert is_same_needle((run, rerun))
     assert not is_same_needle((run, run))
     assert report.main([str(bag), str(again)]) == 0
@@ -192,7 +192,7 @@ def test_verdicts(make_run: MakeRun) -> None:
         status = dataclasses.replace(last, values={**last.values, "target_point_m": text})
         return summarize(dataclasses.replace(run, controller_status=[status]))
 
-    # A run to a point is judged by the point.
+    # The verdict on a run to a point uses the point.
     x, y, z = run.truth.values[-1, :3]
     near = told(f"{x!s}, {y + 0.0003!s}, {z - 0.0004!s}")
     assert near["point_error_mm"] == pytest.approx(0.5)

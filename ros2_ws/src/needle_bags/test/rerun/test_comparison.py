@@ -49,7 +49,7 @@ def test_the_tolerance_is_applied_at_its_bound() -> None:
             result = compare([state(1, **{member: 0.5})], [today])
             assert differing(result) == ({field: 1} if changed else {})
             assert result.changed is changed
-    # A frame has none.
+    # A frame has no tolerance.
     other = Record("needle/reduced_state", 1, {**state(1).values, "header.frame_id": "rig"})
     assert differing(compare([state(1)], [other])) == {"everything else": 1}
 
@@ -74,7 +74,7 @@ def test_covariances_are_compared_in_sigmas() -> None:
     result = compare([pose(covariance=small)], [pose(covariance=other)])
     assert differing(result) == {"covariance": 1}
     assert result.fields[2].largest == pytest.approx(2e-3)
-    # The same difference between angles, whose sigmas are 1 rad, is nothing.
+    # The same difference between angles, whose sigmas are 1 rad, is negligible.
     for before, now, changed in (
         (small, angles, False),
         (nothing, nothing.copy(), False),

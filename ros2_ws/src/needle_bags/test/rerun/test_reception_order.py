@@ -21,7 +21,7 @@ def sent(time: int, topic: str) -> SentMessage:
 
 
 def status(time: int, *heard: tuple[str, int]) -> SentMessage:
-    """What the controller said; `("joints", 7)` is that it had heard the joints sent at 7."""
+    """Return a controller status; `("joints", 7)`: it had received the joints sent at 7."""
     told = ReceptionLog()
     for topic, sent_ns in heard:
         told.add(topic, sent_ns)
@@ -38,7 +38,7 @@ SENT = partial(map, lambda pair: sent(*pair))
 @pytest.mark.parametrize(
     ("messages", "heard"),
     [
-        (  # The order is that of hearing.
+        (  # The order is that of reception.
             [
                 *SENT([(10, J), (11, "result"), (12, "tip"), (20, J)]),
                 *(status(30, ("tip", 12), (J, 10)), sent(40, J)),
@@ -46,13 +46,13 @@ SENT = partial(map, lambda pair: sent(*pair))
             ],
             [("tip", 12), (J, 10), (S, 30), (J, 20), ("result", 11), (J, 40), (S, 50)],
         ),
-        (  # What the last status does not tell was heard after it.
+        (  # Messages that the last status lacks were received after it.
             [*SENT([(10, J), (15, J), (16, X)]), status(20, (J, 10)), sent(30, J)],
             [(J, 10), (X, 16), (S, 20), (J, 15), (J, 30)],
         ),
-        # Of bags that do not tell, the order is that of sending.
+        # Without such statuses, the order is that of sending.
         ([status(20), sent(10, J)], [(J, 10), (S, 20)]),
-        (  # What was sent before the last that was heard, and is not told, was never heard.
+        (  # An unlisted message older than the last received one was never received.
             [
                 *SENT([(10, J), (11, X), (20, J)]),
                 *(status(25, (J, 20)), *SENT([(30, J), (40, J)])),

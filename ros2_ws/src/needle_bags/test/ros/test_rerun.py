@@ -1,4 +1,4 @@
-"""`rerun`: unchanged where nothing changed, red with a gain or a sign that did, one line if bad."""
+"""`rerun`: equal outputs of unchanged code, failure for a wrong gain or sign, one-line errors."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ def given(folder: Path, text: str, node: str = "plane_controller") -> Path:
 
 @pytest.fixture(scope="module")
 def untouched(regression: Path) -> tuple[int, str]:
-    """The whole of the committed bag, run again."""
+    """Rerun the whole committed bag."""
     return printed(regression)
 
 
 @pytest.fixture(scope="module")
 def mirrored(first_pictures: Path) -> tuple[int, str]:
-    """The bag up to its first pictures, run again by code that has a sign turned."""
+    """Rerun the bag up to its first pictures by code with an inverted sign."""
 
     def mirror(document: Any) -> StereoCalibration:
         calibration = parse_calibration(document)
@@ -82,7 +82,7 @@ def mirrored(first_pictures: Path) -> tuple[int, str]:
 
 @pytest.fixture(scope="module")
 def paper_bag(tmp_path_factory: pytest.TempPathFactory, eight_steps: Path) -> Path:
-    """The first steps as preset paper would have them."""
+    """The first steps, as preset paper would command them."""
     bag = tmp_path_factory.mktemp("rerun") / "paper"
     assert rerun(eight_steps, "--preset", "paper", "--output", bag) == 1
     return bag
@@ -95,7 +95,7 @@ def test_unchanged_code_gives_unchanged_outputs(
     assert code == 0, f"{said}\nmeant? scripts/renew_regression_bag"
     assert "6 image pairs through stereo_tracker, 121 tips through plane_controller" in said
     assert "UNCHANGED" in said
-    # The table that people read in a diff belongs to the bag beside it.
+    # The table for reviewers of a diff must match the bag beside it.
     rows = (regression / TABLE).read_text().splitlines()[1:]
     assert len(rows) == read_contents(regression).counts["/needle/estimate"]
 
@@ -123,11 +123,11 @@ def test_a_parameter_off_by_a_hundredth_is_detected(
     assert field in changed_fields(result)
 
 
-def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) -> None:
+def test_another_preset_gives_a_separate_run(eight_steps: Path, paper_bag: Path) -> None:
     code, said = printed(paper_bag)
     assert code == 0
     assert "(paper)" in said
-    # Beyond the outputs it is the same bag.
+    # Apart from the outputs, it is the same bag.
     before, after = read_contents(eight_steps), read_contents(paper_bag)
     assert before.counts == after.counts
     for topic in ("/joint_states", "/device/status", "/sim/tip_pose"):
@@ -154,7 +154,7 @@ def test_tips_without_images_are_kept(eight_steps: Path, tmp_path: Path) -> None
 
 @pytest.fixture(scope="module")
 def shown(first_pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """The bag up to its first pictures, seen by viewers; and what was said, pyigtl being there."""
+    """Rerun the bag up to its first pictures for viewers, with pyigtl; return bag and output."""
     bag = tmp_path_factory.mktemp("rerun") / "shown"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("importlib.util.find_spec", lambda _: True)
@@ -177,7 +177,7 @@ def test_viewers_show_the_recorded_needle_without_comparison(
         assert f"{count} {topic}" in view
     run = read_run(first_pictures)
     seconds = (run.joints.received[-1] - run.joints.received[0]) * 1e-9
-    # Ten times a second, and each picture once.
+    # Ten messages per second, and each picture once.
     assert new[live_view.PATH] == pytest.approx(10 * seconds, abs=3)
     assert {new[topic] for topic in PICTURES} == {before["/stereo/left/image_raw/compressed"]}
     *_, (_, _, path) = read_messages(bag, f"/{live_view.PATH}".__eq__)
@@ -190,7 +190,7 @@ def test_viewers_show_the_recorded_needle_without_comparison(
 
 @pytest.fixture(scope="module")
 def shown_again(shown: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory) -> Shown:
-    """Return what a bag with the viewers' topics gives, taken through the viewers once more."""
+    """Return the rerun of a bag that already contains the viewers' topics."""
     folder = tmp_path_factory.mktemp("again")
     bag, file = folder / "bag", folder / "result.json"
     with pytest.MonkeyPatch.context() as patch:
@@ -209,7 +209,7 @@ def test_recorded_viewer_topics_are_replaced(shown: tuple[Path, str], shown_agai
 
 
 def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: str) -> Any:
-    """Begin a copy of a bag with other texts; return what puts a message of a new topic first."""
+    """Copy a bag with other custom data; the context yields a function to prepend messages."""
     contents = read_contents(bag)
     copy, new = BagCopy(target, "jazzy", custom), standard_topic(topic, kind)
 
@@ -224,7 +224,7 @@ def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: st
 
 
 def test_announced_parameters_are_sufficient(eight_steps: Path, tmp_path: Path) -> None:
-    """What ROS 2's own recorder leaves: no custom data, but /parameter_events."""
+    """A bag of ROS 2's own recorder has no custom data, but /parameter_events."""
     with copied(eight_steps, tmp_path / "bag", {}, "/parameter_events", EVENT) as put:
         node = "/plane_controller"
         put(event(node, read_run(eight_steps).parameters[node]))
@@ -232,7 +232,7 @@ def test_announced_parameters_are_sufficient(eight_steps: Path, tmp_path: Path) 
 
 
 def event(node: str, parameters: dict[str, Any]) -> bytes:
-    """A node's ParameterEvent of its start, as CDR."""
+    """Return the ParameterEvent of a node at its start, as CDR."""
     types = STORE.types
     kinds = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np.float64}
 
@@ -240,7 +240,7 @@ def event(node: str, parameters: dict[str, Any]) -> bytes:
         message = Parameter("", value=content).get_parameter_value()
         fields = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
         for kind, numbers in kinds.items():
-            # rclpy has lists where rosbags wants arrays.
+            # rclpy has lists; rosbags requires arrays.
             name = f"{kind}_array_value"
             fields[name] = np.array(fields[name], numbers)
         return types["rcl_interfaces/msg/ParameterValue"](**fields)
@@ -254,7 +254,7 @@ def event(node: str, parameters: dict[str, Any]) -> bytes:
 def test_the_calibration_is_that_of_the_tracker_or_of_params(
     eight_steps: Path, first_pictures: Path, tmp_path: Path
 ) -> None:
-    """The tracker says it on a topic of its own: nobody has to tell the recorder."""
+    """The tracker publishes it on its own topic, so the recorder needs no setting."""
     text = read_run(eight_steps).calibration
     bag, kind = tmp_path / "bag", "std_msgs/msg/String"
     with copied(
@@ -303,7 +303,7 @@ def test_bad_input_gives_a_one_line_error(
         ("curvature: high", "curvature"),
     ):
         assert rerun(eight_steps, "--params", given(tmp_path, text)) == 2
-        # Of what the bag's nodes had and today's do not have it warns first.
+        # It first warns of parameters in the bag that today's nodes lack.
         lines = capsys.readouterr().err.splitlines()
         (line,) = [line for line in lines if "no longer has" not in line]
         assert words in line

@@ -41,7 +41,7 @@ def test_a_stopped_run_has_not_converged(make_run: MakeRun) -> None:
     assert abs(float(str(summary["r1_final_mm"]))) < 1.0
     assert (summary["converged"], summary["reached_depth"]) == (False, False)
     assert summary["reason"] == "no tip for 2 s"
-    # A tip that is not a number spoils no figure.
+    # A NaN tip spoils no figure.
     assert summary["tip_error_p95_mm"] == pytest.approx(0.5)
     assert summary["tips_not_finite"] == 1
 

@@ -11,7 +11,7 @@ from needle_bags.format.bag_writer import BagCopy, standard_topic
 from needle_bags.run.stage_timing import stage_timings
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-# Every message of a step begins with its stamp, and of that alone the timing is made.
+# Every message of a step begins with its stamp; the timing uses nothing else.
 HEADER = "std_msgs/msg/Header"
 MILLISECOND = 1_000_000
 START = 1_700_000_000_000_000_000
@@ -25,7 +25,7 @@ KEY_VALUE = "diagnostic_msgs/msg/KeyValue"
 
 
 def put(bag: BagCopy, topic: str, stamp: int, sent: int, received: int) -> None:
-    """Write a message that has a stamp."""
+    """Write a message with a stamp."""
     time = STORE.types["builtin_interfaces/msg/Time"](
         sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000
     )
@@ -34,7 +34,7 @@ def put(bag: BagCopy, topic: str, stamp: int, sent: int, received: int) -> None:
 
 
 def put_status(bag: BagCopy, heard: int, sent: int, received: int) -> None:
-    """Write that the device has heard commands up to this stamp."""
+    """Write a status: the device has received commands up to this stamp."""
     values = [STORE.types[KEY_VALUE](key="command_ns", value=str(heard))]
     message = STORE.types[STATUS](level=0, name="", message="", hardware_id="", values=values)
     data = bytes(STORE.serialize_cdr(message, STATUS))
@@ -42,7 +42,7 @@ def put_status(bag: BagCopy, heard: int, sent: int, received: int) -> None:
 
 
 def write(directory: Path, exposure: str) -> Any:
-    """Steps of 100 ms: exposure, then tip, command, joints and result, each so much later."""
+    """Write steps of 100 ms: exposure, then tip, command, joints and result with fixed delays."""
     bag = BagCopy(directory, "jazzy", {})
     for step in range(STEPS):
         sent = START + round(step * PERIOD * MILLISECOND)
@@ -54,7 +54,7 @@ def write(directory: Path, exposure: str) -> Any:
             ("device/result", DEVICE - DRIVER),
         ):
             sent += round(delay * MILLISECOND)
-            # Received late and all at once, as on a busy machine.
+            # All received late and at once, as on a busy machine.
             received = START + round((step * PERIOD + 60.0) * MILLISECOND)
             put(bag, topic, step * 1_000_000_000, sent, received)
     bag.close()
@@ -83,14 +83,14 @@ def test_latency_from_the_later_image_to_the_sync_of_the_first_cycle(
     ms = MILLISECOND
     for step in range(STEPS):
         begin = START + step * 100 * ms
-        # Real time: a stamp is a time of day.
+        # In real time, a stamp is a time of day.
         stamp = begin - 10 * ms
         received = begin + 90 * ms
         put(bag, LEFT, stamp, begin, received)
         put(bag, RIGHT, stamp, begin + 3 * ms, received)
         put(bag, "needle/tip_pose", stamp, begin + 8 * ms, received)
         put(bag, "device/joint_trajectory", stamp, begin + 10 * ms, received)
-        # A cycle is under way when the command is sent: its set-points are older.
+        # A cycle is already running when the command is sent: its set-points are older.
         put_status(bag, stamp - 100 * ms, begin + 11 * ms, received)
         put(bag, "joint_states", begin + 9 * ms, begin + 12 * ms, received)
         put_status(bag, stamp, begin + 13 * ms, received)

@@ -1,4 +1,4 @@
-"""Which press counts, by a rule that looks back from each moment; a joystick must go on talking."""
+"""Accepted presses, compared with a rule on the whole history; time-outs of a joystick."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NO_HANDS: tuple[tuple[int, list[float], list[int], str], ...] = (
 
 
 def counts(seen: list[tuple[InputReading, float]]) -> HoldKind:
-    """Return what may be held at the last moment, looking back: itself alone, since neutral."""
+    """Return the hold allowed at the end of the history: a button pressed alone since neutral."""
     last = seen[-1][0]
     for reading, gap in reversed(seen):
         if reading == NEUTRAL:
@@ -51,7 +51,7 @@ def test_only_a_new_press_from_neutral_is_accepted(
     seen: list[tuple[InputReading, float]],
 ) -> None:
     debouncer, now = HoldDebouncer(), 0.0
-    # Before the first look there is no gap.
+    # There is no gap before the first reading.
     seen[0] = (seen[0][0], 0.0)
     for number, (reading, gap) in enumerate(seen):
         now += gap
@@ -84,7 +84,7 @@ def test_a_suspended_process_requires_a_new_press() -> None:
 
 
 class Joystick(JoySource):
-    """The source of a joystick at half the speed."""
+    """Source for a joystick at half speed."""
 
     def __init__(self) -> None:
         super().__init__(JOYSTICK)
@@ -110,7 +110,7 @@ def test_an_overtaken_message_is_ignored() -> None:
     source.receive([0.0, 1.0], [0, 0, 0], 5.05, stamp=99.98)
     assert source.seen(5.05) == InputState(insert=True, speed=0.5)
     assert isinstance(source.seen(5.00 + 1.001 * JOY_TIMEOUT), InputLost)
-    # A sender whose clock was set back is heard again after a silence, and one without at once.
+    # A sender whose clock was set back counts again after a silence; without stamps, at once.
     source.receive([0.0, 1.0], [0, 0, 0], 5.11, stamp=40.00)
     assert source.seen(5.11) == InputState(speed=0.5)
     source.receive([0.0, 1.0], [1, 0, 0], 5.13)

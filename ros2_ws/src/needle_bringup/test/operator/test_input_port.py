@@ -1,4 +1,4 @@
-"""A pedal or joystick by the bytes that the kernel gives, played by a device of the test."""
+"""Pedal or joystick as bytes from the kernel, sent by a simulated device."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ UP, DOWN, REPEAT = 0, 1, 2
 
 
 def event(kind: int, code: int, value: int) -> bytes:
-    """The bytes of <linux/input.h>'s struct input_event, written by hand."""
+    """Return the bytes of struct input_event of <linux/input.h>, packed by hand."""
     return struct.pack("<qqHHi", 1_700_000_000, 123_456, kind, code, value)
 
 
@@ -41,7 +41,7 @@ def key(code: int, value: int) -> bytes:
 
 
 class PlayedDevice(InputDevice):
-    """Keeps the state of its keys, as the kernel does; sends what was done since the last look."""
+    """Device that keeps the state of its keys as the kernel does, and sends pending events."""
 
     def __init__(self, *down: int) -> None:
         self.keys = frozenset({KEY, RETRACT, STOP})
@@ -73,7 +73,7 @@ class PlayedDevice(InputDevice):
 
 
 class Desk:
-    """A port, the device before it, and a debouncer behind it."""
+    """Port with a simulated device and a debouncer."""
 
     def __init__(self, *down: int, **settings: Any) -> None:
         self.device = PlayedDevice(*down)
@@ -106,15 +106,15 @@ HELD, STOPPED, NOTHING = (
     InputState(stop=True, speed=0.8),
     InputState(speed=0.8),
 )
-# What was sent before each look, and what the look tells.
+# Events before each reading, and the expected reading.
 LOOKS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
-    # A pedal that is held sends nothing.
+    # A held pedal sends nothing.
     (((KEY, DOWN), HELD), ((), HELD), ((KEY, UP), NOTHING)),
     # Key repeat is no press.
     (((KEY, REPEAT, UP), NOTHING), ((STOP, REPEAT, UP), NOTHING)),
-    # A release between two looks is seen.
+    # A release between two readings is detected.
     (((KEY, DOWN), HELD), ((KEY, UP, DOWN), NOTHING), ((), HELD)),
-    # A stop that is only tapped is one.
+    # A short tap of the stop counts.
     (((STOP, DOWN, UP), STOPPED), ((), NOTHING)),
 )
 
@@ -140,7 +140,7 @@ def test_a_key_down_at_the_start_must_be_pressed_again() -> None:
     assert desk.held() is HoldKind.INSERT
 
 
-def test_events_that_the_kernel_dropped_may_have_been_a_release() -> None:
+def test_events_dropped_by_the_kernel_may_include_a_release() -> None:
     desk = Desk()
     desk.read()
     desk.do(KEY, DOWN)
@@ -160,7 +160,7 @@ def test_an_unplugged_pedal_is_lost_and_must_be_pressed_again() -> None:
     assert desk.read() == InputLost(f"/dev/input/pedal: {os.strerror(errno.ENODEV)}")
     assert old.closed
     desk.device, desk.is_there = PlayedDevice(KEY), True
-    # It is looked for now and then.
+    # The port searches for it periodically.
     lost_until = desk.now + OPEN_PERIOD
     while desk.now + CYCLE < lost_until:
         assert isinstance(desk.read(), InputLost)
@@ -220,7 +220,7 @@ def test_ioctls_of_an_input_device(monkeypatch: pytest.MonkeyPatch) -> None:
     assert device.keys_down() == {10}
     assert set_bits(bytes([0b1, 0, 0b10000010])) == {0, 17, 23}
     assert device.axis(AXIS) == pytest.approx(2.0 * 192.0 / 255.0 - 1.0)
-    # As a C program prints them that includes <linux/input.h>.
+    # Values printed by a C program that includes <linux/input.h>.
     assert asked == [0x80604521, 0x80604518, 0x80184542]
     assert input_device.eviocgabs(3) == 0x80184543
     assert device.read() == b""

@@ -1,4 +1,4 @@
-"""The operator as a component: what a hand does becomes the hold, calls and words."""
+"""The operator as a component: input of a person becomes the hold, calls and log lines."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NEUTRAL, OUT = InputState(), InputState(retract=True)
 
 
 class Scene:
-    """An operator before a hand, in a rig that agrees to what is called."""
+    """Operator with an input device, in a rig that accepts all calls."""
 
     def __init__(self, settings: OperatorParameters) -> None:
         self.operator = Operator(settings)
@@ -62,7 +62,7 @@ class Scene:
                 assert isinstance(action, Diagnose)
 
     def update(self, reading: InputReading = NEUTRAL, **status: Any) -> m.HoldState:
-        """Let the device say something, then the hand at the port do."""
+        """Handle a device status, then a reading of the port."""
         self.now += PERIOD
         (row,), (port,) = self.operator.inputs, self.operator.ports
         if status:
@@ -71,7 +71,7 @@ class Scene:
         return self.holds[-1]
 
     def joy(self, *down: int, silent: bool = False) -> m.HoldState:
-        """Let a joystick be heard, then be looked at."""
+        """Handle a joystick message, then run the timer."""
         self.now += 0.2 if silent else PERIOD
         buttons = tuple(int(button in down) for button in range(3))
         if not silent:
@@ -93,7 +93,7 @@ def test_a_pedal_is_held_until_it_is_lost() -> None:
     assert scene.logs[-1] == "nothing is held: unplugged"
     for _ in range(2):
         assert not scene.update(InputState(insert=True)).pressed
-    # What does not change is said once.
+    # An unchanged state is logged once.
     assert [text for text in scene.logs if "the press is ignored" in text] == scene.logs[-1:]
     assert [hold.count for hold in scene.holds] == list(range(1, len(scene.holds) + 1))
     assert len({hold.session for hold in scene.holds}) == 1
@@ -101,7 +101,7 @@ def test_a_pedal_is_held_until_it_is_lost() -> None:
 
 def test_a_joystick_holds_sets_the_speed_stops_and_times_out() -> None:
     scene = Scene(JOYSTICK)
-    # Pressed from the start on: it does not count.
+    # A press from before the start does not count.
     assert not scene.joy(0).pressed
     scene.joy()
     assert scene.joy(0).pressed
@@ -118,7 +118,7 @@ def test_a_joystick_holds_sets_the_speed_stops_and_times_out() -> None:
 def test_the_controller_is_stopped_before_a_withdrawal() -> None:
     scene = Scene(PEDAL)
     scene.update()
-    # The hold of this look was made before the answer came.
+    # This hold was published before the answer arrived.
     assert not scene.update(OUT).pressed
     assert scene.called == [STOP_STEERING]
     assert scene.update(OUT).pressed
@@ -130,7 +130,7 @@ def test_the_controller_is_stopped_before_a_withdrawal() -> None:
     scene.update()
     for _ in range(60):
         scene.update(OUT)
-    # Nobody takes the hold.
+    # The device ignores the hold.
     assert not scene.holds[-1].pressed
     assert "not withdrawn: the device ignores the hold" in scene.logs[-1]
 

@@ -1,4 +1,4 @@
-"""Drawing out by a held button: never a hold beside a controller that steers."""
+"""Retraction with a held button: no hold while a controller steers."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ IN_VAIN = (
 
 
 def holds(retraction: RetractionSequence) -> bool:
-    """What mypy takes for the same after a call may have changed."""
+    """Return the hold; a call, because mypy would narrow the attribute."""
     return retraction.holds
 
 
 def at_step(steps: int) -> RetractionSequence:
-    """Return a button's retraction after so many steps, 1 s in.
+    """Return the retraction of a button after a number of steps, at 1 s.
 
-    The controller was told to stop, has, the device was told to retract, and has agreed.
+    Steps: the controller has stopped, the device was told to retract, and it has agreed.
     """
     retraction = RetractionSequence("operator")
     retraction.handle_device("", "none", 0.0)
@@ -67,7 +67,7 @@ def test_without_a_controller_the_hold_starts_immediately() -> None:
 def test_a_release_ends_the_sequence_and_a_new_press_restarts_it() -> None:
     retraction = at_step(3)
     assert retraction.update(False, 2.0, controller=True) is None
-    # What was asked for before comes too late.
+    # The answer to the earlier request comes too late.
     retraction.handle_answer(STOP_STEERING, True, "stopped", 2.1)
     assert not holds(retraction)
     assert retraction.update(True, 3.0, controller=True) == STOP_STEERING

@@ -1,4 +1,4 @@
-"""The paper's numbers from runs that are known, its page, figures, --json and command line."""
+"""`paper`: numbers of known runs, page, figures, --json and command line."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_settled_is_the_last_entry_into_the_band() -> None:
 def test_missed_runs_are_evaluated_again_farther_in() -> None:
     runs = {"r1_final_mm": np.array([0.5, -1.5, 3.0, 1.2])}
     longer = {"r1_final_mm": np.array([5.0, 0.2, -2.0, 0.9])}
-    # the first had not missed: what it does later does not count
+    # the first had not missed: its later part does not count
     assert missed_later(runs, longer) == (3, 1, 2.0)
     assert missed_later({"r1_final_mm": np.zeros(2)}, {"r1_final_mm": np.zeros(2)}) == (0, 0, 0.0)
 
@@ -93,7 +93,7 @@ def test_runs_are_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         (laboratory.study, ("two", "--draws", "1")),
         (laboratory.identify, ("three", "one", "--from-mm", "5")),
     ):
-        # Nothing has run, so nothing is there to be read.
+        # Without runs there are no results to read.
         with pytest.raises((FileNotFoundError, UserError)):
             work(*words)
     bag = str(tmp_path / "one")
@@ -125,7 +125,7 @@ def a_run() -> Run:
 
 
 class MadeUpLaboratory(Laboratory):
-    """Every trial is one bag, and every study the same runs: four miss, and farther in one."""
+    """Laboratory whose trials are all one bag, and whose studies have the same runs."""
 
     def trial(self, name: str, *arguments: str) -> Run:
         return a_run()
@@ -148,7 +148,7 @@ class MadeUpLaboratory(Laboratory):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder with all that `paper` writes of made-up runs."""
+    """Return the folder with the output of `paper` for made-up runs."""
     folder = tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_results, "Laboratory", MadeUpLaboratory)

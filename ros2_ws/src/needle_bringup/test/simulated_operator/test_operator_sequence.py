@@ -1,4 +1,4 @@
-"""Order of what the stand-in does: when it calls, holds, gives up, and what it never acts on."""
+"""Sequence of the simulated operator: calls, holds, failures, and when it must not act."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def hear(sequence: OperatorSequence, now: float = 2.0, **said: Any) -> None:
 
 
 def unheard() -> OperatorSequence:
-    """Return a sequence that has heard nothing, and misses nobody."""
+    """Return a sequence that has received no status and misses no partner."""
     sequence = OperatorSequence(0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0)
     sequence.handle_missing([])
     return sequence
 
 
 def fresh() -> OperatorSequence:
-    """Return a sequence before a simulated device that is alone."""
+    """Return a sequence with a single simulated device."""
     sequence = unheard()
     sequence.handle_devices(["/sim_rig"])
     see(sequence, FRESH, 0.0)
@@ -52,12 +52,12 @@ def fresh() -> OperatorSequence:
 
 
 def outcome(sequence: OperatorSequence) -> Exit | None:
-    """Return the outcome; a call, so that mypy does not take it for settled once it was None."""
+    """Return the outcome; a call, because mypy would narrow the attribute."""
     return sequence.outcome
 
 
 def why(sequence: OperatorSequence) -> str:
-    """Return the reason of a run that failed."""
+    """Return the reason for which a run failed."""
     assert sequence.outcome is not None
     assert sequence.outcome.code != 0
     assert not sequence.hold()
@@ -66,7 +66,7 @@ def why(sequence: OperatorSequence) -> str:
 
 
 def reach(wanted: Call | None = None, sequence: OperatorSequence | None = None) -> OperatorSequence:
-    """Return a sequence that has just made a call, for the first time, at 1.0 s; None: all."""
+    """Return a sequence just after its first attempt of a call, at 1.0 s; None: after all calls."""
     sequence = sequence or fresh()
     see(sequence, DISABLED)
     for call in PREPARATION:
@@ -97,7 +97,7 @@ def test_it_repeats_calls_until_the_rig_is_ready_or_refuses() -> None:
     sequence.handle_answer(CONFIRM, False, not_yet, 1.0)
     assert sequence.next_call(1.05) is None
     for now, refusal in ((20.0, not_yet), (20.2, "the needle is in"), (22.2, "the needle is in")):
-        # What a refusal rests on may have changed meanwhile.
+        # The cause of a refusal may have changed meanwhile.
         assert outcome(sequence) is None
         assert sequence.next_call(now) == CONFIRM
         sequence.handle_answer(CONFIRM, False, refusal, now)
@@ -131,7 +131,7 @@ def test_an_earlier_status_does_not_end_the_homing() -> None:
     sequence = reach(HOME)
     sequence.handle_answer(HOME, True, "homing", 1.0)
     assert sequence.next_call(1.0) is None
-    # A device may say that it is homed, from last time, while it looks for its switches.
+    # A device may still report homed from last time while it searches for its switches.
     for homed in (False, True):
         see(sequence, dataclasses.replace(MOVING, homed=homed), 2.0)
         assert sequence.next_call(2.0) is None
@@ -148,7 +148,7 @@ def test_a_status_may_replace_the_answer_of_homing() -> None:
     assert lost.next_call(5.0) is None, "it moves: not asked again"
     see(lost, DISABLED, 9.0)
     assert lost.next_call(9.0) == ENABLE
-    # Homed from before the call is no answer to it.
+    # A homed status from before the call does not replace the answer.
     see(stale, dataclasses.replace(DISABLED, needle_out_confirmed=True), 1.1)
     assert stale.next_call(1.2) is None
     assert stale.next_call(1.0 + CALL_TIMEOUT) == HOME
@@ -209,8 +209,8 @@ def test_statuses_before_the_start_are_ignored() -> None:
         assert sequence.outcome.code == 0
 
 
-def test_a_start_that_ends_immediately() -> None:
-    """STEERING, then IDLE: a latched status of depth 1 may show the second alone."""
+def test_a_start_that_ends_immediately_fails_the_run() -> None:
+    """STEERING, then IDLE: a latched status of depth 1 may show only the second."""
     for state, overtakes in itertools.product(("FAULT", "IDLE"), (False, True)):
         sequence = fresh()
         hear(sequence, 0.5, state="IDLE")
@@ -245,7 +245,7 @@ def test_an_ignored_press_is_released_and_repeated() -> None:
         see(sequence, HOLDING, 9.1)
         assert sequence.hold(), "the device has heard the release"
         assert sequence.presses_again == 1
-        # On a busy machine news come late: what nothing is said of may be a step under way.
+        # On a busy machine statuses arrive late: a step may be under way without one.
         see(sequence, dataclasses.replace(HOLDING, press_again="somebody"), 9.2)
         sequence.check_time(50.0)
         assert sequence.hold()

@@ -1,4 +1,4 @@
-"""The stand-in as a component: what a rig says becomes the hold, calls, and an end."""
+"""The simulated operator as a component: rig messages become the hold, calls, and an end."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RIG = "sim_rig"
 
 
 class Scene:
-    """The stand-in in a rig that agrees to what is called, unless it is mute."""
+    """Simulated operator in a rig that accepts all calls, or answers none."""
 
     def __init__(self, *, refusal: str = "", mute: bool = False, **settings: Any) -> None:
         self.operator = SimulatedOperator(SimulatedOperatorParameters(**settings), "stand_in")
@@ -62,7 +62,7 @@ class Scene:
                         self.take(self.operator.on_answer(answer, self.at))
 
     def run(self, seconds: float = 1.0, **said: Any) -> None:
-        """Let the controller say something, and time pass."""
+        """Publish a controller status, and advance time."""
         self.controller = dataclasses.replace(self.controller, **said)
         rows = {row.topic: row.handler for row in self.operator.inputs}
         for _ in range(round(seconds / 0.05)):
@@ -84,7 +84,7 @@ def steered() -> Scene:
 def test_the_component_prepares_holds_releases_and_disables() -> None:
     scene = Scene(mute=True)
     scene.run(0.2)
-    # A press from before it was ready would not count.
+    # A press before the device is ready would not count.
     assert scene.holds
     assert not any(hold.pressed for hold in scene.holds)
     scene.mute = False

@@ -1,4 +1,4 @@
-"""The command lines of `simulate` and `console`: what they mean, and what they refuse."""
+"""Command lines of `simulate` and `console`: meaning and rejections."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from needle_bringup.simulation.virtual_run import own_component
 from needle_controller.presets.steering_settings import PRESETS
 from needle_core.errors import UserError
 
-# Words that cannot be run, and what of them the one line names.
+# Invalid arguments, and the part that the error names.
 REFUSED = (
     ("--controller worst", "worst"),
     ("--insertion sideways", "sideways"),

@@ -1,4 +1,4 @@
-"""The console's rig in one process, with a page that nobody serves."""
+"""The console's rig in one process, without a served page."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Ends = Callable[["PlayedRunner"], bool]
 
 
 class PlayedDesk:
-    """Stands for the page, which takes an extra to be served."""
+    """Stand-in for the page, which needs an extra to be served."""
 
     def __init__(self, settings: ConsoleParameters) -> None:
         if settings.hold_port == 9999:
@@ -36,7 +36,7 @@ class PlayedDesk:
 
 
 class PlayedRunner:
-    """Runs nothing, until what a test wants ends it."""
+    """Runner that does nothing until the test ends it."""
 
     ends: Ends
     last: PlayedRunner

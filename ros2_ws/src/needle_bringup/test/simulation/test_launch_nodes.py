@@ -1,4 +1,4 @@
-"""What the launch files start. `launch` itself is not on PyPI; it adds no rule of its own."""
+"""Nodes started by the launch files. `launch` itself is not on PyPI; it adds no rule."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
         (beside_rig, {"bag": bag}, "already contains a bag"),
         (simulated, {"bag": bag}, "already contains a bag"),
         (simulated, {"seed": "-1"}, "--seed = -1"),
-        # A driver that nobody configures would run on its defaults.
+        # A driver without configuration would run on its defaults.
         (beside_rig, {"drives": emulator}, "'drive_emulator' is not started here, only device_d"),
         (simulated, {"params": operator}, "'simulated_operator' is not started here, only sim_rig"),
         (
@@ -68,7 +68,7 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
 def test_a_rig_has_the_nodes_of_its_files(tmp_path: Path) -> None:
     plain = beside_rig()
     assert set(plain) == {"stereo_tracker", "plane_controller"}
-    # Images that are sent best effort are heard.
+    # Best-effort images are received.
     assert plain["stereo_tracker"]["reliable_images"] is False
     registration = file_of(tmp_path, "registration")
     tracked = beside_rig(registration=registration)
@@ -123,7 +123,7 @@ def test_an_existing_bag_is_played_for_viewers(tmp_path: Path) -> None:
     assert replayed_nodes(arguments) == {"player": {}, "live_view": {}}
     words = replay_words({**arguments, "namespace": "/first"})
     assert words["player"] == [str(tmp_path), "--rate", "0.5", "--start", "2.0", "--loop"]
-    # What a rig would obey is played under /replay only.
+    # Topics that control a rig are played only under /replay.
     assert "target_plane:=/replay/first/target_plane" in words["live_view"]
 
 

@@ -1,4 +1,4 @@
-"""A rig's nodes as processes that a test plays: started, watched, and ended in their order."""
+"""Simulated node processes of a rig: start, supervision, and ordered end."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ DRIVE_NODES = (
 
 
 class Played(NodeProcess):
-    """A node's process as a test plays it; it ends on the signals that it heeds."""
+    """Simulated process of a node; it ends on the signals that it handles."""
 
     all: ClassVar[dict[str, Played]] = {}
     sent: ClassVar[list[tuple[str, signal.Signals]]] = []
     ended: ClassVar[dict[str, int]] = {}
-    """Codes of nodes that end by themselves."""
+    """Exit codes of nodes that end by themselves."""
 
     def __init__(
         self,
@@ -66,14 +66,14 @@ class Played(NodeProcess):
 
 @pytest.fixture(autouse=True)
 def played(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every node be played, and let nobody wait for one that stays."""
+    """Simulate every node, and do not wait for one that stays."""
     for kept in (Played.all, Played.sent, Played.ended):
         kept.clear()
     monkeypatch.setattr(node_graph, "NodeProcess", Played)
     monkeypatch.setattr(node_graph, "TERMINATE_GRACE", 0.0)
 
 
-def test_every_executable_is_a_node_that_parameter_files_know() -> None:
+def test_every_executable_is_a_known_node_of_parameter_files() -> None:
     assert {name for _, name, _ in executables("node")} == set(NODES)
 
 
@@ -125,7 +125,7 @@ def test_a_graph_ends_in_order_and_warns_of_recording_errors(
 
 @dataclasses.dataclass
 class Graph:
-    """A run of `simulate --graph` at level drive."""
+    """Run of `simulate --graph` at level drive."""
 
     bag: Path
 
@@ -147,7 +147,7 @@ def test_a_graph_runs_until_its_operator_ends(graph: Graph) -> None:
     assert tuple(Played.all) == DRIVE_NODES
     assert {node.environment["ROS_DOMAIN_ID"] for node in Played.all.values()} != {""}
     operator = Played.all["simulated_operator"]
-    # The progress alone goes to the terminal.
+    # Only the progress is printed to the terminal.
     assert operator.environment["NEEDLE_PROGRESS_FD"] == str(operator.kept_open[0])
     assert all(node.exit_code is not None for node in Played.all.values())
 

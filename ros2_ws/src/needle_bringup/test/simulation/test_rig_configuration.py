@@ -1,4 +1,4 @@
-"""What a command line sets in the nodes, all told of one needle; what contradicts is said."""
+"""Node parameters from a command line agree on one needle; contradictions are reported."""
 
 from __future__ import annotations
 
@@ -103,8 +103,8 @@ def test_the_controller_knows_the_sensor_of_its_level() -> None:
 
 
 def test_the_launched_rig_is_that_of_simulate() -> None:
-    # What simulate tells the nodes beyond their defaults is said on the command line, or concerns
-    # recording and the emulated adapter: nothing of it describes the rig.
+    # Beyond the defaults, simulate sets only what the command line gives, recording, and the
+    # emulated adapter: nothing of it describes the rig.
     of_run = {"level", "seed", "preset"}
     of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
     set_by_simulate = {node: set(values) - of_run for node, values in told("--level drive").items()}

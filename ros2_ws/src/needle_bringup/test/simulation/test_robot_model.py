@@ -1,4 +1,4 @@
-"""robot_model: what it writes agrees, and each difference of another URDF is named."""
+"""robot_model: a written URDF agrees, and each difference of another one is named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`simulate` in this process: what a run leaves, and what it says."""
+"""`simulate` in this process: files of a run, and messages."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_run_leaves_bag_report_and_summary(ended: tuple[int, Path]) -> None:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
-    """Return, for each kind of run, that of a seed, the same again, and that of another."""
+    """Return for each kind of run the bags of a seed, of the same seed again, and of another."""
     folder, drive = tmp_path_factory.mktemp("recorded"), ("--level", "drive", "--depth-mm", "1")
     kinds = {"tip": WORDS, "drive": drive, "continuous": (*WORDS, "--insertion", "continuous")}
     runs = {}
@@ -147,7 +147,7 @@ def test_an_unfinished_run_names_its_first_cause(stopped: Run) -> None:
     said = simulate.describe(summary, Path("bags/run")).splitlines()
     assert said[0] == "NOT FINISHED: stopped at 30.0 mm: no tip for 2 s"
     *before, waits, ends = stopped.controller_status
-    # A tip that is found again was no cause; what device or simulation say before it is one.
+    # A tip that was found again is no cause; an earlier report of device or simulation is one.
     again = dataclasses.replace(before[-1], log_time=waits.log_time + 5)
     run = dataclasses.replace(stopped, controller_status=[*before, waits, again, ends])
     assert stop_cause(run) == "device is off"

@@ -1,4 +1,4 @@
-"""The whole rig in this process: it gets there in spite of faults, and stops where it must."""
+"""The whole rig in this process: it converges despite faults, and stops when it must."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ OPERATOR = "simulated_operator"
 
 
 class Rig:
-    """The rig of a command line on a virtual runner, and what its components send."""
+    """Rig of a command line on a virtual runner, and the messages of its components."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ def test_a_tip_that_leaves_the_phantom_ends_the_run() -> None:
 
 @pytest.fixture(scope="module")
 def lossy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, str]:
-    """Return a rig whose tracker did not hear every image, and what its rerun says."""
+    """Return a rig whose tracker missed some images, and the output of its rerun."""
     folder = tmp_path_factory.mktemp("lossy")
     bag, images = folder / "bag", str(folder / "images")
     words = ("--level", "camera", "--depth-mm", "3")
@@ -152,7 +152,7 @@ def test_pairs_are_exposed_only_when_a_tip_is_expected(lossy: tuple[Rig, str]) -
     rig, _ = lossy
     assert rig.depth == pytest.approx(0.003, abs=1e-5)
     pairs, tips = len(rig.sent["stereo/left/image_raw"]), len(rig.sent["needle/tip_pose"])
-    # One at each depth, and again, a second later, where none came.
+    # One at each depth, and another a second later if no tip came.
     assert 4 == tips < pairs < 12
 
 
@@ -194,7 +194,7 @@ def late(latest: float) -> Fault:
 
 @pytest.fixture(scope="module", params=["stepwise", "continuous"])
 def late_bag(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
-    """Return the bag of a run whose controller heard all messages late, and stood still."""
+    """Return the bag of a run whose controller received messages late and was frozen once."""
     bag = tmp_path_factory.mktemp("late") / "bag"
     words = ("--level", "tip", "--depth-mm", "2", "--insertion", request.param)
     rig = Rig(*words, faults=(late(0.04),), bag=bag)
@@ -214,7 +214,7 @@ def test_a_rerun_with_late_messages_is_unchanged(
 
 @pytest.fixture(scope="module", params=["cia402", "stepdir", "cia402,stepdir"])
 def driven(request: pytest.FixtureRequest) -> Rig:
-    """Return a rig at level drive that has come to its end."""
+    """Return a rig at level drive after its run."""
     rig = Rig("--level", "drive", "--depth-mm", "1", "--drives", request.param)
     assert rig.until_end() == 0
     return rig

@@ -1,4 +1,4 @@
-"""Cameras and tracker behind a port: what is handed on, what comes back, what is lost."""
+"""Cameras and tracker behind a port: passed, returned and lost messages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def exposure(insertion: float, stamp_ns: int = AT.stamp_ns) -> Exposure:
 
 
 class PlayedPool:
-    """Works in this process, at once; once it has ended it takes nothing."""
+    """Pool that works in this process at once; after its end it accepts nothing."""
 
     def __init__(self, begin: Callable[..., None], *given: object) -> None:
         begin(*given)
@@ -50,7 +50,7 @@ class PlayedPool:
 
 @pytest.fixture(scope="module")
 def process() -> Iterator[tuple[VisionProcess, list[Any]]]:
-    """Return cameras and tracker as in their process, and what has arrived from there."""
+    """Return cameras and tracker as in their process, and the received answers."""
     arrived: list[Any] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(vision, "start_worker", PlayedPool)
@@ -65,7 +65,7 @@ def test_an_exposure_becomes_images_and_a_tip_near_the_truth(
 ) -> None:
     (eyes, arrived), seen = process, exposure(0.05)
     around = [m.JointState(AT.stamp_ns + n, (m.INSERTION_JOINT,), (0.05,)) for n in (0, 1)]
-    # With the insertion known, one look is enough.
+    # With a known insertion, one pair is enough.
     eyes.send([(item, AT) for item in (*around, seen, None)])
     actions: list[Action] = [action for batch in arrived for action in batch[0].result()]
     sent = {action.topic: action.message for action in actions if isinstance(action, Publish)}
@@ -86,7 +86,7 @@ def test_fast_exposures_are_dropped_and_failures_raised() -> None:
     joints = m.JointState(AT.stamp_ns, (m.INSERTION_JOINT,), (0.0,))
     sent = list(hand_on[CAMERAS]((seen, seen, seen), AT))
     assert sent == [Send(VISION, ((seen, AT),))] * 2
-    # Joints and time are never lost.
+    # Joint states and time are never dropped.
     sent = [*row.handler(joints, AT), *timer.handler(AT)]
     assert [action.batch[0][0] for action in sent if isinstance(action, Send)] == [joints, None]
     assert list(hand_on[CAMERAS]((seen,), AT)) == []

@@ -1,4 +1,4 @@
-"""Studies on a cluster that the test plays: the same bits, in order, whoever is lost."""
+"""Studies on a simulated cluster: identical, ordered results despite lost workers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class KilledWorker(Exception):
 
 
 class Future:
-    """A part that is done when its result is asked for."""
+    """Part that is computed when its result is requested."""
 
     def __init__(self, key: str, work: Callable[[], Any]) -> None:
         self.key, self.result = key, work
@@ -40,7 +40,7 @@ class Future:
 
 
 class Dask(types.ModuleType):
-    """Stands for `distributed`: does parts here, the last first, as long as nothing is lost."""
+    """Stand-in for `distributed`: computes parts here, last first, until a connection is lost."""
 
     KilledWorker, CancelledError = KilledWorker, LostConnection
 
@@ -48,7 +48,7 @@ class Dask(types.ModuleType):
         super().__init__("distributed")
         self.answers = True
         self.lost_after: list[int] = []
-        """Of each connection, the parts after which it is lost."""
+        """Number of parts after which each connection is lost."""
         self.asked: list[int] = []
 
     def Client(self, address: str, timeout: float) -> Dask:

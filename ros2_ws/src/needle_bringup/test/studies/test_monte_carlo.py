@@ -22,7 +22,7 @@ KEYS = {
     *("inside_2_sigma", "inside_3_sigma", "doubtful_at_end", "trusted_far_off"),
     *("within_1_mm_point", "rms_point_mm"),
 }
-# Words that cannot be run, and what of them the one line names.
+# Invalid arguments, and the part that the error names.
 REFUSED = (
     ("--controller nobody", "nobody"),
     ("--grid hexagonal", "hexagonal"),
@@ -81,7 +81,7 @@ def study(folder: Path, words: str) -> tuple[dict[str, Any], list[dict[str, str]
         return json.loads((folder / "f.json").read_text("utf-8")), list(csv.DictReader(stream))
 
 
-def test_open_loop_s_known_answer_in_json_and_csv(tmp_path: Path) -> None:
+def test_the_known_result_of_open_loop_is_in_json_and_csv(tmp_path: Path) -> None:
     words = "--controller open_loop --initial -3,2,15 --draws 1 --slip 0.0 --seed 5"
     figures, rows = study(tmp_path, words)
     assert set(figures) >= KEYS
@@ -93,7 +93,7 @@ def test_open_loop_s_known_answer_in_json_and_csv(tmp_path: Path) -> None:
     assert [row["run"] for row in rows] == [str(number) for number in range(1000)]
     assert float(rows[0]["r1_final_mm"]) == pytest.approx(14.62, abs=0.005)
     assert rows[0]["settle_mm"] == ""
-    # Each run says what it was run with: files of several studies make one table.
+    # Each row contains its settings, so that files of several studies can be joined.
     for name, value in {"slip": "0.0", "seed": "5", "controller": "open_loop"}.items():
         assert rows[0][name] == value
     assert rows[0]["rotation_deg"] != rows[0]["most_rotation_deg"] == "1e6"
@@ -110,9 +110,9 @@ def test_targets_have_figures_of_points_and_none_of_the_plane(tmp_path: Path, la
     figures, rows = study(tmp_path, f"--targets 4 --depth-mm 8 --controller {law}")
     assert set(figures) >= KEYS
     assert (figures["runs"], figures["converged_at_end"]) == (4, None)
-    # 8 mm are not enough for any of them
+    # 8 mm are too short for all of them
     assert (figures["within_1_mm_point"], figures["missed_runs"]) == (0.0, 4)
-    # It knows where it is, and says that this is not the point.
+    # The controller knows its position, and reports that it missed the point.
     assert (figures["doubtful_at_end"], figures["trusted_far_off"]) == (1.0, 0.0)
     error = np.array([float(row["error_mm"]) for row in rows])
     assert figures["rms_point_mm"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-4)
@@ -161,7 +161,7 @@ def test_disturbances_are_in_si_and_independent_of_the_claim() -> None:
 
 @pytest.mark.parametrize("asked", ["--targets 11", "--controller paper --draws 1"])
 def test_a_part_of_a_study_gives_the_same_outcomes_as_the_whole(asked: str) -> None:
-    """Wherever it is cut: so that parts can be steered on many machines."""
+    """Any division is valid, so that parts can run on many machines."""
     disturbed = (
         "--depth-mm 8 --target-drift-mm-per-s 0.1 --play-deg 10 --push 1 --roll-walk 2 "
         "--bias-walk 1"

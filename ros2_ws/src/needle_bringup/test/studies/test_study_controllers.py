@@ -1,4 +1,4 @@
-"""Controllers of studies: what they are told, and what their needles say of themselves."""
+"""Controllers of studies: their inputs, and the estimates of their needles."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TIPS = np.array([[0.0005, 0.0, 0.001], [-0.0005, 0.0, 0.0012]])
 
 
 class Recorder(HypothesisFilter):
-    """Keeps how far it was advanced, and with which covariances it is corrected."""
+    """Filter that records its advances and the covariances of its corrections."""
 
     def __init__(self) -> None:
         self.given: list[Any] = []
@@ -50,7 +50,7 @@ class Recorder(HypothesisFilter):
 
 
 def still(estimate: Any, insertion: float) -> SteeringCommand:
-    """Turn nothing."""
+    """Do not turn the needle."""
     return SteeringCommand(0.0, 0.0)
 
 
@@ -78,7 +78,7 @@ def test_the_controller_gets_the_claimed_noise(monkeypatch: pytest.MonkeyPatch) 
     assert corrected[0].given == [None]
     # uniform noise within 2 mm has a variance of (2 mm)^2 / 3; sigmas half as large
     np.testing.assert_allclose(corrected[-1].given[0], np.eye(3) * 0.002**2 / 3.0 / 4.0)
-    # The base turns by an answer that comes late after it has gone on.
+    # The base turns only after the turn delay.
     np.testing.assert_allclose(corrected[0].advanced, [(0.0004, 0.0), (0.0006, 1.0)])
 
 
@@ -106,7 +106,7 @@ def test_python_and_compiled_loops_give_the_same_bits() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_the_belief_is_that_of_the_estimates() -> None:
+def test_the_belief_follows_from_the_estimates() -> None:
     needles = SteeredNeedles(
         lambda count: BestEstimators(FilterSettings(), count, 0.001), each_rate(lambda _: still)
     )
@@ -126,7 +126,7 @@ def test_the_belief_is_that_of_the_estimates() -> None:
         assert belief.sin_pitch_std[n] == pytest.approx(to_first_order, rel=0.02)
     assert belief.missed is not None
     assert np.all((belief.missed > 0.0) & (belief.missed < 0.5))
-    # The paper's observer makes no use of a covariance.
+    # The paper's observer uses no covariance.
     paper = controller_factory("paper", 0.001)()
     paper.start(TIPS)
     assert paper.belief() is None
@@ -140,7 +140,7 @@ def test_needles_off_their_target_report_a_miss() -> None:
         each_rate(lambda _: still),
     )
     needles.start(tips)
-    # What counts is the point, not the plane x = 0.
+    # The point counts, not the plane x = 0.
     to_points = point_controller_factory("best", 0.001)()
     to_points.set_targets(0.0, tips[::-1] + np.array([[0.0, 0.0009, 0.0], [0.0, 0.0, 0.06]]))
     to_points.start(tips[::-1])

@@ -1,4 +1,4 @@
-"""Effects of cameras: an image stays where it is and as bright as told."""
+"""Camera effects: an image keeps its geometry and gets the requested brightness."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def centre(image: np.ndarray) -> np.ndarray:
     ],
     ids=str,
 )
-def test_nothing_moves(changes: dict[str, object]) -> None:
+def test_camera_effects_do_not_move_the_image(changes: dict[str, object]) -> None:
     effects = dataclasses.replace(PLAIN, **changes)  # type: ignore[arg-type]
     seen = effects.apply(np.random.default_rng(0), scene())
     assert seen.dtype == np.uint8
@@ -62,7 +62,7 @@ def test_nothing_moves(changes: dict[str, object]) -> None:
     np.testing.assert_allclose(centre(seen), centre(scene()), atol=0.3)
 
 
-def test_a_plain_camera_changes_edges_alone_and_gain_and_noise_are_as_told() -> None:
+def test_a_plain_camera_changes_only_edges_and_gain_and_noise_are_as_requested() -> None:
     plain = PLAIN.apply(np.random.default_rng(0), scene())
     assert np.abs(plain.astype(float) - scene())[:36].max() == 0.0
     dark = dataclasses.replace(PLAIN, gain=0.5).apply(np.random.default_rng(0), scene())

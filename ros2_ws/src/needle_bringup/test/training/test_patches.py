@@ -1,4 +1,4 @@
-"""Drawn samples to train on: what is wanted of them is what they show."""
+"""Drawn training samples: they show what was requested."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_needle_slides_along_its_own_curve() -> None:
     pose = Pose(60.0, 48.0, 0.3, 2e-3, 1e-5, 2.5)
     whole, shorter = (true_map(each, SIZE) for each in (pose, pose.slid(-20.0)))
     assert whole.sum() - shorter.sum() == pytest.approx(20.0 * 5.0, rel=0.05)
-    # What is left of it lies where it lay.
+    # The remaining part stays in place.
     assert np.maximum(shorter - whole, 0.0).sum() < 0.03 * shorter.sum()
     back = pose.slid(-20.0).slid(20.0)
     assert np.hypot(back.x - pose.x, back.y - pose.y) < 0.5
@@ -57,7 +57,7 @@ def test_tracks_without_a_background_are_faint() -> None:
             factor = drawn_tracks(np.random.default_rng(seed), pose, CANVAS, faint=faint)
             assert factor.min() > 0.0
             strongest[faint] = max(strongest[faint], float(np.abs(factor - 1.0).max()))
-    # Three may lie over each other.
+    # Up to three may overlap.
     assert strongest[True] < 1.15**3 - 1.0
     assert strongest[False] > 0.5
 
@@ -95,7 +95,7 @@ def test_patches_have_needles_backgrounds_and_ends_or_none() -> None:
     samples = [patch(np.random.default_rng([3, n])) for n in range(7)]
     for sample in samples:
         assert sample.image.shape == sample.share.shape == (CANVAS, CANVAS)
-        # No end without a shaft; a shaft's end may be outside.
+        # No end without a shaft; but the end of a shaft may be outside.
         assert np.isnan(sample.end).all() or sample.share.any() or sample.end.min() < 0.0
         if sample.share.any():
             assert np.isfinite(sample.end).all()

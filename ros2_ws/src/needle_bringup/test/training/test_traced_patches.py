@@ -1,4 +1,4 @@
-"""Path-traced scenes and the samples that are cut from them: the truth goes with the image."""
+"""Path-traced scenes and the samples cut from them: the labels follow the image."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RIG = load_stereo_rig(find_shared_file("needle_tracker", "config/calibration_top
 
 
 def bars(width_px: float) -> TracedScene:
-    """Return a scene with bright bars for a needle, longer and longer, before grain."""
+    """Return a scene with ever longer bright bars as needles, in front of grain."""
     shares = np.zeros((6, 300, 400), np.uint8)
     half = round(0.5 * width_px)
     ends = np.full((6, 2), np.nan)
@@ -60,7 +60,7 @@ def test_a_sample_and_its_labels_are_rotated_and_scaled_alike() -> None:
             if (share > 0.95).sum() < 60:
                 continue
             with_needle += 1
-            # Whatever the camera, needle is brighter than what is around it.
+            # With every camera, the needle is brighter than its surroundings.
             assert image[share > 0.95].mean() > image[share < 0.01].mean()
             if (np.abs(sample.end - 0.5 * CANVAS) < 0.5 * SIZE - 12).all():
                 ends += 1
@@ -72,7 +72,7 @@ def test_a_sample_and_its_labels_are_rotated_and_scaled_alike() -> None:
     assert ends > 10
 
 
-def test_half_of_the_samples_know_a_background_of_the_same_camera() -> None:
+def test_half_of_the_samples_have_a_background_of_the_same_camera() -> None:
     scene = bars(4.0)
     samples = [traced_patch(np.random.default_rng(seed), [scene]) for seed in range(60)]
     known = [sample for sample in samples if sample.background is not None]
@@ -89,7 +89,7 @@ def test_half_of_the_samples_know_a_background_of_the_same_camera() -> None:
 def test_the_width_of_a_shaft_is_that_of_its_outline() -> None:
     line = np.linspace([0.0, 0.0, 0.001], [0.003, -0.004, 0.06], 200)
     ahead = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
-    # Points of its surface all around the end: the farthest ones across the line are its edges.
+    # Surface points around the end: those farthest across the line are the edges.
     angle = np.linspace(0.0, 2.0 * np.pi, 400)[:, None]
     one = np.cross(ahead, [1.0, 0.0, 0.0])
     one /= np.linalg.norm(one)
@@ -127,5 +127,5 @@ def test_a_scene_is_the_empty_phantom_then_a_needle_in_both_cameras(
     assert not scene.shares[:2].any()
     assert np.isnan(scene.ends[:2]).all()
     assert scene.shares[2:].any(axis=(1, 2)).all()
-    # Where it will be in the empty phantom it is as wide as in the first pair.
+    # In the empty phantom, the later place of the needle is as wide as in the first pair.
     np.testing.assert_array_equal(scene.widths_px[:2], scene.widths_px[2:4])

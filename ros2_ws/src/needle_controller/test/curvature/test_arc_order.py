@@ -63,7 +63,7 @@ def test_outliers_are_not_correlated_residuals() -> None:
 
 
 def test_repeating_errors_are_tolerated() -> None:
-    """All tips bowed along the arc, three times, as by a calibration's error."""
+    """All tips are bowed along the arc three times, as by a calibration error."""
     rng = default_rng(7)
     tips, insertion = insertion_tips(1, 0.12, rng)
     bowed = tips[0] + noise(tips[0].shape, 2e-6, rng)

@@ -55,7 +55,7 @@ def test_exact_tips_give_the_exact_curvature(known: bool) -> None:
     ],
 )
 def test_60_mm_of_noisy_tips(settings: CurvatureFitSettings, known: bool) -> None:
-    """Of 2,500 seeds the spread is 6.5 %, the bias 0.5 %; these are 160."""
+    """With 2,500 seeds, the spread is 6.5 % and the bias 0.5 %; this test has 160."""
     rng = default_rng(2)
     tips, insertion = insertion_tips(160, 0.06, rng)
     fit = fit_curvature(uniform(tips, rng), insertion if known else None, settings)
@@ -70,7 +70,7 @@ def test_60_mm_of_noisy_tips(settings: CurvatureFitSettings, known: bool) -> Non
 
 @pytest.mark.parametrize(("entry_std", "slip"), [(1e-6, -0.1), (0.0005, 0.0), (0.0005, 0.05)])
 def test_slip_is_estimated_without_bias_of_the_curvature(slip: float, entry_std: float) -> None:
-    """Before slip was an unknown 5 % of it made 4 to 19 % of the radius."""
+    """When slip was not estimated, 5 % of it changed the radius by 4 to 19 %."""
     rng = default_rng(12)
     tips, insertion = insertion_tips(160, 0.06, rng)
     settings = CurvatureFitSettings(entry_std=entry_std)
@@ -149,7 +149,7 @@ def test_bad_tips_are_refused() -> None:
 
 
 def test_errors_that_repeat_widen_the_interval_and_more_tips_do_not_help() -> None:
-    """Exact tips, all bowed by 0.02 mm: the residuals are next to nothing, the curvature is off."""
+    """Exact tips, all bowed by 0.02 mm: small residuals, but a wrong curvature."""
     for count in (61, 601):
         insertion = np.linspace(0.0, 0.06, count)
         angle = insertion / RADIUS

@@ -67,12 +67,12 @@ def paths(count: int, rng: np.random.Generator) -> Array:
 def test_the_forecast_of_a_straight_needle_is_gaussian_process_regression(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The same model in the form of covariances between positions."""
+    """Compare with the same model in the form of covariances between positions."""
     scale = 0.3
     monkeypatch.setattr(tip_forecast, "SCALES", np.array([scale]))
     settings = CurvatureFitSettings(slip_std=1e-6, measurement_std=NOISE, outlier_limit=math.inf)
     seen = paths(1, np.random.default_rng(5))[0, : len(INSERTION)]
-    # A tenth of it: the sine of the heading is the heading.
+    # Scaled to a tenth laterally, the sine of the heading equals the heading.
     seen = np.column_stack([0.1 * seen[:, :2], INSERTION])
     checked = fit_checked(seen, INSERTION, settings)
     ahead = forecast_tip(seen, True, checked, AHEAD)

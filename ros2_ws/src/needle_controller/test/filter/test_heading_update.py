@@ -91,7 +91,7 @@ def test_a_heading_that_cannot_be_true_changes_nothing() -> None:
 
 
 def test_a_heading_decides_between_hypotheses() -> None:
-    """A tip that is hardly known, 10 mm deep, and its heading: only the true roll remains."""
+    """An uncertain tip, 10 mm deep, and its heading: only the true roll remains."""
     rolls = tuple(RollHypothesis(np.deg2rad(roll), 0.05, 1.0) for roll in (0.0, 90.0))
     settings = FilterSettings(roll_hypotheses=rolls, initial_angle_std=STD)
     pose = path(np.zeros(10), roll=np.deg2rad(90.0))[-1]
@@ -125,7 +125,7 @@ def measured(pose: Array, rng: np.random.Generator) -> Array:
 
 
 def test_the_estimate_is_that_of_a_batch_least_squares_fit() -> None:
-    """On an arc of 15 mm: positions, headings and the prior, without noise of the process."""
+    """On an arc of 15 mm: positions, headings and the prior, without process noise."""
     roll_std, angle_std = np.deg2rad(5.0), np.deg2rad(8.0)
     settings = FilterSettings(
         torsion_hypotheses=(TorsionHypothesis(0.0, 0.0, 0.0, 1.0, 0.0, 0.0),),
@@ -170,7 +170,7 @@ def test_the_estimate_is_that_of_a_batch_least_squares_fit() -> None:
     assert np.linalg.norm(heading_off) < 0.1 * std[4]
     curvature_std = np.sqrt(np.linalg.inv(fit.jac.T @ fit.jac)[6, 6])
     assert abs(estimate.curvature - fit.x[6]) < 0.1 * curvature_std
-    # The heading is known far better than from the tips alone.
+    # The heading is known far better than from tips alone.
     alone = followed(settings, poses, tips, turns, std=0.0)
     assert std[4] < 0.4 * np.sqrt(alone.covariance[4, 4])
 

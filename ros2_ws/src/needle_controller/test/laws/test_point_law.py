@@ -30,7 +30,7 @@ ASIDE, AHEAD = [0.035, 0.0, 0.1], [0.0, 0.0, 0.1]
 
 
 def estimate(pose: Array, std: float = 0.0) -> Estimate:
-    """Return what an estimator says that knows a pose, (4, 4)."""
+    """Return the estimate of an estimator that knows a pose, (4, 4)."""
     angles = Rotation.from_matrix(pose[:3, :3]).as_euler("XYZ")
     return known(np.concatenate([pose[:3, 3], angles]), std)
 
@@ -58,22 +58,22 @@ def free() -> PointLaw:
     return law(max_rotation_per_length=1e5, largest_turn=100.0)
 
 
-def test_the_need_of_a_point_is_the_arc_that_leads_there() -> None:
+def test_the_need_of_a_point_is_the_bending_of_its_arc() -> None:
     need, length = np.empty(2), 0.08
     for share in (0.1, 0.9):
         curvature = share * CURVATURE
         tip_in_start = moved(np.eye(4), length, 0.0, curvature)[:3, 3].copy()
         assert write_need(tip_in_start, need) == pytest.approx(length)
-        # Towards -y, where a needle bends whose bevel is not turned.
+        # Towards -y, the direction in which an unturned bevel bends.
         np.testing.assert_allclose(need, [0.0, -0.5 * curvature * length**2], atol=1e-12)
-    # One beside or behind needs nothing and is passed.
+    # A point beside or behind the tip needs no bending and is passed.
     assert write_need(np.array([0.001, 0.0, -0.002]), need) == -0.002
     np.testing.assert_array_equal(need, 0.0)
     assert write_need(np.array([0.0, 0.0, 0.05]), need) == 0.05
 
 
-def test_what_no_arc_leads_to_is_nearest_after_what_is_said() -> None:
-    """The oracle looks along the arcs of all curvatures up to the needle's."""
+def test_an_unreachable_point_is_nearest_at_the_returned_length() -> None:
+    """The oracle searches the arcs of all curvatures up to the needle's."""
     lengths, bend = np.linspace(0.0, 0.1, 2001)[:, None], np.linspace(1e-6, CURVATURE, 51)
     x, z = (1.0 - np.cos(bend * lengths)) / bend, np.sin(bend * lengths) / bend
     for target in ((0.0, -0.003, 0.005), (0.06, 0.0, 0.03), (0.0, 0.0, 0.05)):
@@ -83,7 +83,7 @@ def test_what_no_arc_leads_to_is_nearest_after_what_is_said() -> None:
         assert found == pytest.approx(lengths[nearest, 0], abs=1e-4)
 
 
-def test_what_is_left_of_a_need_is_the_integral_of_the_bending() -> None:
+def test_the_rest_of_a_need_follows_from_the_integral_of_the_bending() -> None:
     left, length, need = 0.03, 0.007, np.array([0.002, -0.001])
     for rate in (0.0, 1e-7, 200.0, -523.0):
 
@@ -96,9 +96,9 @@ def test_what_is_left_of_a_need_is_the_integral_of_the_bending() -> None:
         np.testing.assert_allclose(rest, expected, atol=1e-10)
 
 
-def test_turns_the_shorter_way_to_where_the_needle_bends_to_the_point() -> None:
+def test_the_bevel_takes_the_shorter_turn_towards_the_point() -> None:
     for around in np.deg2rad([10.0, 100.0, -60.0, 170.0]):
-        # Near the edge of what can be reached: no waiting; without roll it bends towards -y.
+        # Near the edge of the reachable region: no waiting; without roll it bends towards -y.
         target = [0.035 * np.cos(around), 0.035 * np.sin(around), 0.10]
         turn = float(free()(estimate(entry()), target).rotation_rate) * STEP
         turned = Rotation.from_euler("z", turn).as_matrix() @ [0.0, -1.0, 0.0]
@@ -107,7 +107,7 @@ def test_turns_the_shorter_way_to_where_the_needle_bends_to_the_point() -> None:
 
 
 @pytest.mark.parametrize("budget_deg", [0.0, 100.0, 360.0, 1e9])
-def test_a_budget_is_kept_and_two_half_turns_lead_to_the_point(budget_deg: float) -> None:
+def test_the_turn_budget_is_kept_and_two_half_turns_reach_the_point(budget_deg: float) -> None:
     pose, target, budget = entry(), [0.01, -0.003, 0.09], np.deg2rad(budget_deg)
     point_law, rotation = law(), 0.0
     for _ in range(200):
@@ -125,7 +125,7 @@ def test_a_budget_is_kept_and_two_half_turns_lead_to_the_point(budget_deg: float
 
 
 def next_turn(left: float, kept: float) -> float:
-    """Return what is left after bending from 1 - kept of the curvature to as much across [m]."""
+    """Return the rest after bending with 1 - kept of the curvature, then as much across [m]."""
     need = (1.0 - kept) * left**2
 
     def beyond(end: float) -> float:
@@ -134,7 +134,7 @@ def next_turn(left: float, kept: float) -> float:
     return float(brentq(beyond, 0.0, left))
 
 
-def test_what_is_kept_back_takes_all_half_turns_to_the_last_turn() -> None:
+def test_the_reserve_lets_all_half_turns_end_at_the_last_turn() -> None:
     last_turn = 0.008
     for half_turns in (1, 2, 5):
         left = 0.1
@@ -145,20 +145,20 @@ def test_what_is_kept_back_takes_all_half_turns_to_the_last_turn() -> None:
     assert affordable_reserve(0.1, math.inf, last_turn) == 1.0
 
 
-def test_waits_while_a_later_turn_will_do_and_no_longer() -> None:
-    # Bending to the point, it is left alone.
+def test_a_turn_waits_as_long_as_a_later_one_suffices() -> None:
+    # While it bends towards the point, it is not turned.
     arc = moved(entry(70.0), 0.08, 0.0)
     command = law()(estimate(entry(70.0)), arc[:3, 3])
     assert command.rotation_rate == 0.0
     assert command.insertion_left == pytest.approx(0.08)
-    # With the point straight ahead, far away, it may bend anywhere for a while.
+    # With a distant point straight ahead, it may bend anywhere for a while.
     assert law()(estimate(entry()), AHEAD).rotation_rate == 0.0
     eager = law(reserve=1.0)(estimate(entry()), AHEAD).rotation_rate
     assert abs(float(eager)) == pytest.approx(CAP)
-    # The less is known, the earlier it turns.
+    # With more uncertainty it turns earlier.
     unsure = law()(estimate(entry(), std=np.deg2rad(10.0)), AHEAD).rotation_rate
     assert abs(float(unsure)) == pytest.approx(CAP)
-    # 3 mm before the point half a turn, which takes 6 mm, is made only if that is nearer.
+    # Half a turn takes 6 mm; 3 mm before the point it is made only if that ends nearer.
     assert float(law()(estimate(entry()), [0.00006, 0.00005, 0.003]).rotation_rate) > 0.0
     near = law(close_enough=0.0001)(estimate(entry()), [0.0, 0.00002, 0.003])
     assert near.rotation_rate == 0.0
@@ -172,18 +172,18 @@ def test_each_hypothesis_turns_from_its_own_roll_through_its_play_and_may_unwind
     assert turn(mixture([0.0])) == pytest.approx(quarter)
     assert turn(mixture([0.3, -0.1])) == pytest.approx(quarter - 0.1)
     assert turn(mixture([0.0], play=0.4)) == pytest.approx(quarter + 0.4)
-    # At the limit of winding the other way round is taken.
+    # At the winding limit it turns the other way round.
     wound = mixture([0.0], wound=6.0 * np.pi - 0.5)
     assert float(law()(mixture([0.0]), ASIDE).rotation_rate) == pytest.approx(CAP)
     assert float(law()(wound, ASIDE).rotation_rate) == pytest.approx(-CAP)
-    # Rolls that disagree leave the needle alone.
+    # If the rolls disagree, the needle is not turned.
     scattered = mixture([0.0], agreement=0.1)
     assert law(scatter_dead_band=3.0)(scattered, ASIDE).rotation_rate == 0.0
 
 
-def test_torsion_makes_it_turn_in_time() -> None:
+def test_torsion_makes_the_turn_start_earlier() -> None:
     def waits_until(needle: Estimate) -> float:
-        """Return how near a point straight ahead comes before the bevel is turned [m]."""
+        """Return the distance of a point straight ahead at which the bevel is turned [m]."""
         ahead = np.arange(0.1, 0.0, -0.001)
         return float(next(z for z in ahead if law()(needle, [0.0, 0.0, z]).rotation_rate != 0.0))
 
@@ -192,7 +192,7 @@ def test_torsion_makes_it_turn_in_time() -> None:
         assert waits_until(mixture([0.0], **columns)) > waits_until(mixture([0.0])) + 0.001
 
 
-def test_many_needles_are_steered_as_each_alone() -> None:
+def test_many_needles_equal_single_ones() -> None:
     filters = ManyFilters(FilterSettings(), 3, STEP)
     filters.start(np.array([[0.001, 0.0, 0.0], [0.0, 0.0005, 0.0], [-0.001, 0.0, 0.0]]))
     filters.advance(np.full(3, STEP), np.array([0.1, -0.4, 1.0]))

@@ -41,7 +41,7 @@ def test_the_plant_reaches_the_plane_in_the_least_insertion() -> None:
     assert float(plant.insertion) == pytest.approx(least, abs=1e-12)
 
 
-def test_random_rolls_never_beat_the_farthest_offsets_and_those_take_all_insertion() -> None:
+def test_random_rolls_never_exceed_the_farthest_offsets_which_need_all_insertion() -> None:
     rng, count, h = default_rng(1), 5_000, 0.06 / 240
     x, pitch, sine = np.zeros(count), np.full(count, 0.1), np.zeros(count)
     for k in range(240):
@@ -95,7 +95,7 @@ def path(curvatures: Array, length: float) -> Array:
     return np.array([np.sum(np.sin(heading)), 0.0, np.sum(np.cos(heading))]) * part
 
 
-def test_the_soonest_way_to_a_point_is_an_arc_and_a_straight() -> None:
+def test_the_shortest_path_to_a_point_is_an_arc_and_a_straight_line() -> None:
     for bend_deg, straight in ((0.0, 0.05), (20.0, 0.03), (60.0, 0.0)):
         arc, parts = np.deg2rad(bend_deg) / CURVATURE, 20_000
         on_arc = round(parts * arc / (arc + straight))
@@ -105,7 +105,7 @@ def test_the_soonest_way_to_a_point_is_an_arc_and_a_straight() -> None:
         assert least == pytest.approx(arc + straight, abs=1e-5)
 
 
-def test_no_path_ends_sooner_than_it_may_nor_beyond_the_widest_place() -> None:
+def test_no_path_is_shorter_than_the_least_insertion_or_beyond_the_widest_offset() -> None:
     rng = default_rng(3)
     for _ in range(100):
         length = rng.uniform(0.02, 0.15)
@@ -132,7 +132,7 @@ def test_no_path_ends_sooner_than_it_may_nor_beyond_the_widest_place() -> None:
     assert there.depth == pytest.approx(0.1)
 
 
-def test_refusals_of_a_point_say_why_and_from_where_it_would_go() -> None:
+def test_rejections_of_a_point_give_the_reason_and_a_better_entry() -> None:
     check_point([0.01, 0.005, 0.09], CURVATURE, 0.12)
     with pytest.raises(UserError, match="ahead of the entry"):
         check_point([0.0, 0.0, 0.0], CURVATURE, 0.12)

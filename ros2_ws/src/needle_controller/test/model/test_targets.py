@@ -1,4 +1,4 @@
-"""Planes in `rig`, and a target that drifts, breathes, jumps, or rests: where it is expected."""
+"""Planes in `rig`, and prediction of targets that drift, breathe, jump or rest."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def sine(rate: float) -> Path:
 
 
 def chest(rate: float) -> Path:
-    """Return a breath that rests when it is out, as a sleeper's does."""
+    """Return a breath that rests after exhalation, as a sleeper's does."""
     return lambda t: PLACE + DRIFT * t + 2.0 * BREATH * np.cos(np.pi * rate * t) ** 4
 
 
@@ -57,7 +57,7 @@ def test_a_general_pose_is_a_rigid_transform() -> None:
     assert moved.offset == pytest.approx(plane.offset)
 
 
-def test_planes_nothing_can_reach_are_refused() -> None:
+def test_unreachable_planes_are_rejected() -> None:
     unit, half = [0.0, 0.0, 0.0, 1.0], np.sqrt(0.5)
     rows: list[tuple[str, list[float], list[float], str]] = [
         ("left_camera_optical", [0.0] * 3, unit, "left_camera_optical"),
@@ -76,12 +76,12 @@ def test_planes_nothing_can_reach_are_refused() -> None:
     steep = plane_from_pose("rig", [0.0] * 3, [0.0, np.sin(0.6), 0.0, np.cos(0.6)])
     with pytest.raises(UserError, match="reaches no plane"):
         check_plane(steep, 1 / 0.122, 0.12)
-    # Of a part of an insertion nothing is said.
+    # A smaller depth is checked as SHORTEST_CHECKED_DEPTH.
     for offset, depth in ((0.02, 0.12), (0.02, 0.01), (0.05, 0.19)):
         check_plane(offset_plane(offset), 1 / 0.122, depth)
 
 
-def test_a_target_at_rest_or_hardly_observed_is_expected_where_it_was_to_the_bit() -> None:
+def test_a_target_at_rest_or_hardly_observed_is_predicted_exactly_at_its_last_position() -> None:
     for motion in (
         seen(lambda _: PLACE, 0.0),
         seen(lambda _: PLACE, 30.0),
@@ -93,24 +93,24 @@ def test_a_target_at_rest_or_hardly_observed_is_expected_where_it_was_to_the_bit
     np.testing.assert_allclose(walking.at(60.0), walking.last, atol=1e-5)
 
 
-def test_time_that_goes_back_starts_anew() -> None:
+def test_the_prediction_restarts_when_time_goes_back() -> None:
     motion = seen(sine(0.2), 25.0)
     for time in np.arange(3.0, 13.0, 0.25):
         motion.see(float(time), drift(float(time)))
     np.testing.assert_allclose(motion.at(15.0), drift(15.0), atol=1e-4)
 
 
-def test_a_motion_is_foretold_whatever_its_shape_and_clock() -> None:
+def test_a_motion_is_predicted_whatever_its_shape_and_clock() -> None:
     for path, begin in itertools.product((drift, sine(0.12), sine(0.33), chest(0.2)), (0.0, 1.7e9)):
         motion = seen(path, 25.0, begin=begin)
         for time in (26.0, 30.0, 35.0):
             np.testing.assert_allclose(motion.at(begin + time), path(time), atol=1e-4)
 
 
-def test_a_fast_drift_is_foretold_after_three_seconds() -> None:
+def test_a_fast_drift_is_predicted_after_three_seconds() -> None:
     path: Path = lambda t: PLACE + 30.0 * DRIFT * t  # noqa: E731
     np.testing.assert_allclose(seen(path, 3.0).at(50.0), path(50.0), atol=1e-3)
-    # A breath that looks like a drift for so long is not followed far away.
+    # A breath that resembles a drift for so long is not followed far away.
     for rate in (0.1, 0.15, 0.2, 0.33):
         away = seen(sine(rate), 3.0).at(50.0) - PLACE
         assert np.linalg.norm(away) < 0.015
@@ -125,14 +125,14 @@ def test_noise_is_averaged() -> None:
     assert np.sqrt(np.mean(np.square(errors))) < 2e-4
 
 
-def test_after_a_jump_it_is_where_it_was_seen_and_breathes_on() -> None:
+def test_after_a_jump_a_target_breathes_about_its_new_position() -> None:
     calm = sine(0.2)
     path: Path = lambda t: calm(t) + (0.003 if t > 20.0 else 0.0)  # noqa: E731
     assert np.linalg.norm(seen(path, 20.5).last - path(20.5)) == 0.0
     np.testing.assert_allclose(seen(path, 32.0).at(36.0), path(36.0), atol=1e-4)
 
 
-def test_many_targets_are_each_as_alone() -> None:
+def test_many_targets_equal_single_ones() -> None:
     paths: list[Path] = [sine(0.2), chest(0.3), lambda _: PLACE, drift]
     both = seen(lambda t: np.stack([path(t) for path in paths]), 25.0)
     times = np.array([26.0, 27.0, 28.0, 29.0])
@@ -146,8 +146,8 @@ def test_a_fast_topic_takes_no_more_memory_than_a_slow_one() -> None:
     np.testing.assert_allclose(fast.at(30.0), sine(0.2)(30.0), atol=1e-4)
 
 
-def test_nothing_is_foretold_far_from_where_it_was_seen() -> None:
-    """Samples at odd times can leave a period nearly free: what it says of later is then noise."""
+def test_no_target_is_predicted_far_from_its_observed_positions() -> None:
+    """Samples at odd times can leave a period nearly undetermined: its prediction is then noise."""
     rng = np.random.default_rng(6)
     for _ in range(60):
         times = np.sort(rng.uniform(0.0, 8.0, rng.integers(7, 12)))

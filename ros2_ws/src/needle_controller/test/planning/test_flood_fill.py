@@ -60,7 +60,7 @@ def test_a_wall_with_a_gap_has_a_path_and_one_without_has_none() -> None:
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_gap_counts_only_within_reach_of_needle_and_target(sign: float) -> None:
-    # Over half of 100 mm a needle that returns gets 9.2 mm aside, one that does not 9.6 mm.
+    # Within 50 mm a needle can move 9.2 mm aside and return, or 9.6 mm without returning.
     assert may(wall(0.004, sign * 0.004))
     assert not may(wall(0.004, sign * 0.014))
     aside = np.array([sign * 0.025, 0.0, 0.1])

@@ -22,19 +22,19 @@ from needle_core.process.shutdown import ENDING_SIGNALS, ShutdownFlag, interrupt
 
 
 class LeftError(BaseException):
-    """Stands for the end of the process by `os._exit`."""
+    """Stand-in for the end of the process by `os._exit`."""
 
 
 @pytest.fixture(autouse=True)
 def _handlers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let no process end, and leave every signal as it was."""
+    """Keep the process alive, and restore all signal handlers."""
 
     def leave(code: int) -> NoReturn:
         raise LeftError(code)
 
     monkeypatch.setattr(os, "_exit", leave)
     before = {number: signal.getsignal(number) for number in ENDING_SIGNALS}
-    # A shell's background, where tests may run, ignores SIGINT, and nohup SIGHUP.
+    # Background jobs of a shell, in which tests may run, ignore SIGINT; nohup ignores SIGHUP.
     for number in ENDING_SIGNALS:
         signal.signal(number, signal.default_int_handler)
     yield
@@ -70,7 +70,7 @@ def test_an_internal_error_is_one_line_and_in_development_a_traceback_before_it(
     assert last.startswith("error: internal error")
 
 
-def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_output_pipe_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     for count in (1, 10**6):
         reader, writer = os.pipe()
         os.close(reader)
@@ -79,7 +79,7 @@ def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch) -> No
             assert run_command(lambda n=count: print("x" * n) or 1) == 0  # type: ignore[misc]
 
 
-def test_json_goes_into_a_file_or_says_why_not(tmp_path: Path) -> None:
+def test_json_is_written_or_the_error_gives_the_reason(tmp_path: Path) -> None:
     write_json(tmp_path / "file", {"a": math.inf})
     assert (tmp_path / "file").read_text() == '{\n  "a": null\n}\n'
     with pytest.raises(UserError, match=r"cannot write .*: Is a directory"):
@@ -100,7 +100,7 @@ def test_a_signal_sets_the_flag_and_ends_nothing(number: signal.Signals) -> None
     assert signal.getsignal(number) is before
 
 
-def test_a_hangup_that_is_ignored_stays_so() -> None:
+def test_an_ignored_hangup_stays_ignored() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with ShutdownFlag() as end:
         signal.raise_signal(signal.SIGHUP)
@@ -152,7 +152,7 @@ def test_a_signal_while_modules_are_loaded_ends_at_once(
 @pytest.mark.parametrize(
     ("kind", "end"), [(executables.node, LeftError), (executables.command, SystemExit)]
 )
-def test_the_exit_code_and_the_last_words_come_through(
+def test_the_exit_code_and_the_last_output_are_passed_on(
     kind: Callable[[str], Any],
     end: type[BaseException],
     tmp_path: Path,

@@ -33,7 +33,7 @@ def test_unknown_arguments_are_a_user_error_and_help_keeps_its_lines() -> None:
     assert parser.format_help().endswith("example:\n  study --seed 1\n")
 
 
-def test_a_number_is_one_and_lies_within_its_bounds() -> None:
+def test_numbers_are_parsed_and_bounded() -> None:
     assert number("--depth-mm", "120", 1.0, 120.0, "mm") == 120.0
     assert number("--until-mm", "inf", 0.0, math.inf, "mm") == math.inf
     with pytest.raises(OutOfBoundsError, match=r"--depth-mm = 121 mm is outside \[1, 120\] mm"):
@@ -56,7 +56,7 @@ def test_an_output_file_needs_an_existing_folder(tmp_path: Path) -> None:
             output_file("--json", bad)
 
 
-def test_a_start_may_begin_with_a_minus_and_lies_within_its_bounds() -> None:
+def test_a_start_may_begin_with_a_minus_and_is_bounded() -> None:
     parser = CommandParser("study", "", "")
     parser.add_argument("--initial")
     for text in ("-3,2,15", "-.5,2,15", "50,-45,-180"):

@@ -61,7 +61,7 @@ def rosbag(
 
 
 def plain(bag: Path, **how: Any) -> Path:
-    """Replace a bag's data by a file of mcap's own writer; return it."""
+    """Replace the data of a bag by a file of mcap's own writer; return the file."""
     (file,) = bag.glob("*.mcap")
     write_mcap(file, **how)
     return file
@@ -81,7 +81,7 @@ def read(path: Path, topics: tuple[str, ...] = TOPICS, **when: int) -> list[int]
 
 
 def reason(path: Path) -> str:
-    """Why a bag is refused: one line."""
+    """Return the one-line reason for which a bag is rejected."""
     with pytest.raises(UserError) as caught:
         read(path)
     assert "\n" not in str(caught.value)
@@ -89,7 +89,7 @@ def reason(path: Path) -> str:
 
 
 def refusal(bag: Path) -> str:
-    """Reason of a rejection: reader and `recover` report the same, and change nothing."""
+    """Return the reason of a rejection; reader and `recover` give the same, and change nothing."""
     before = {file: file.read_bytes() for file in bag.iterdir()}
     said = reason(bag)
     with pytest.raises(UserError) as caught:

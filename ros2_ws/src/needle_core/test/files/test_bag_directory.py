@@ -59,7 +59,7 @@ def test_a_bag_of_another_recorder_is_read(
         assert read(file) == ALL
 
 
-def test_a_definition_is_read_part_by_part_as_it_is_as_a_whole() -> None:
+def test_a_definition_is_read_the_same_in_parts_and_as_a_whole() -> None:
     jazzy = get_typestore(Stores.ROS2_JAZZY)
     for name in sorted(jazzy.fielddefs)[::12]:
         text, _ = jazzy.generate_msgdef(name, ros_version=2)

@@ -26,7 +26,7 @@ def test_yaml_without_duplicate_keys_is_read_unchanged(value: object, flow: bool
     assert load_yaml(yaml.safe_dump(value, default_flow_style=flow)) == value
 
 
-def test_a_key_that_stands_twice_is_named_with_its_line() -> None:
+def test_a_duplicate_key_is_named_with_its_line() -> None:
     for text, key, line in (
         ("a: 1\na: 2", "a", 2),
         ("b:\n  - {a: 1}\n  - a: 1\n    c: [a, a]\n    a: 2", "a", 5),

@@ -31,7 +31,7 @@ def kept(**environment: str) -> dict[str, str]:
 
 @pytest.fixture
 def own(tmp_path: Path) -> str:
-    """Profiles of the user's own."""
+    """Discovery profiles of the user."""
     (tmp_path / "profiles.xml").touch()
     return str(tmp_path / "profiles.xml")
 
@@ -64,7 +64,7 @@ def test_the_discovery_range_decides_with_and_without_shared_memory(
     assert kept() == {DISCOVERY_RANGE: "LOCALHOST", PROFILES: str(THIS_MACHINE)}
 
 
-def test_profiles_of_the_users_own_stay_and_are_named(
+def test_profiles_of_the_user_stay_and_are_named(
     own: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for shared_memory in (True, False):
@@ -138,7 +138,7 @@ def test_nodes_that_are_started_together_find_each_other() -> None:
 
 
 def elements(file: Path, *left_out: str) -> list[tuple[str, str]]:
-    """Return tags and texts of a profile's elements, without some elements and their content."""
+    """Return tags and texts of a profile's elements, except some elements and their content."""
 
     def is_left_out(element: ElementTree.Element) -> bool:
         name = element.tag.removeprefix(_NAMES)

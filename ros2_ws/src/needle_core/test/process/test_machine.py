@@ -56,7 +56,7 @@ def test_dead_ports_are_removed_and_others_stay(tmp_path: Path) -> None:
     }
 
 
-def test_a_domain_is_one_holders_and_left_as_clean_as_it_is_found() -> None:
+def test_a_domain_has_one_holder_and_is_left_clean() -> None:
     with reserve_domain_id() as domain, reserve_domain_id() as another:
         assert domain != another
         assert dead_ports(ports_of(domain)) == []

@@ -18,11 +18,11 @@ from needle_core.ros.main import run_node
 
 @dataclasses.dataclass(frozen=True)
 class NoParameters:
-    """None."""
+    """Empty parameters of a node."""
 
 
 class Middleware:
-    """Stands for rclpy and its one node, which has one publisher."""
+    """Stand-in for rclpy and its one node, which has one publisher."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.done: list[str] = []

@@ -44,7 +44,7 @@ class Sender(Component):
 
 
 class Receiver(Component):
-    """Stores received messages with their moment."""
+    """Stores received messages with their time."""
 
     def __init__(self, name: str = "receiver", delivery: Delivery = RELIABLE) -> None:
         self.name = name
@@ -66,7 +66,7 @@ class Receiver(Component):
 
 
 class Once(Component):
-    """Does something at 0.5 s, and keeps the answers to its calls."""
+    """Acts once at 0.5 s, and keeps the answers to its calls."""
 
     def __init__(self, actions: Sequence[Action], name: str = "once") -> None:
         self.name = name

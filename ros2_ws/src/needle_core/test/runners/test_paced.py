@@ -45,7 +45,7 @@ class Worker(Component):
 
 
 class Line:
-    """What is outside."""
+    """Port to the outside, without a device."""
 
     def __init__(self) -> None:
         self.sent: list[Any] = []

@@ -35,7 +35,7 @@ from scenario.transport_faults import delay, drop, duplicate, silence
 from .runner_scene import Once, Receiver, Sender, Server, Wired, run
 
 NUMBER = 0
-"""Of a request: the scene's server knows it."""
+"""Number of a request, by which the server of the scene identifies it."""
 
 
 def texts(told: Sequence[tuple[int, str, Any]]) -> list[str]:
@@ -45,7 +45,7 @@ def texts(told: Sequence[tuple[int, str, Any]]) -> list[str]:
 # ---- messages -----------------------------------------------------------------------------------
 
 
-def test_the_same_seed_is_the_same_run_and_another_seed_another() -> None:
+def test_a_seed_determines_the_run() -> None:
     one, again, other = (run([Sender(), Receiver()], seed=seed)[1] for seed in (1, 1, 2))
     assert one == again
     assert one != other
@@ -62,7 +62,7 @@ def test_another_component_changes_no_draw_of_the_others() -> None:
     assert late[0] == late[1] != []
 
 
-def test_a_message_takes_its_time_and_says_when_it_was_sent() -> None:
+def test_a_message_is_delayed_and_has_its_time_of_sending() -> None:
     receiver, late = Receiver(), Receiver()
     run([Sender(), receiver])
     for _, at in receiver.received:

@@ -33,7 +33,7 @@ def checked(file: Path, text: str, node: str, *more: str) -> list[str]:
     return check_command_line(words, node)
 
 
-def test_sections_of_which_none_reaches_it_stop_the_node(file: Path) -> None:
+def test_sections_for_other_names_stop_the_node(file: Path) -> None:
     for text, node, section in (
         (DRIVES, "/rig1/device_driver", "device_driver"),
         (f"/*/{DRIVES}", "/device_driver", "/*/device_driver"),

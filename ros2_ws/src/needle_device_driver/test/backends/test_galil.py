@@ -48,7 +48,7 @@ class Script:
         self.link.open()
 
     def take(self) -> list[str]:
-        """Return the commands that were sent, except beats; | is a line end in a download."""
+        """Return the sent commands, except beats; | is a line end in a download."""
         data = b"".join(self.link.pop_outgoing()).decode()
         program, backslash, rest = data.partition("\\")
         lines = rest if backslash else data
@@ -60,7 +60,7 @@ class Script:
             self.protocol.on_line(line)
 
     def run(self, procedure: Procedure[T]) -> T:
-        """Run a procedure; each command is answered within 1 ms."""
+        """Run a procedure that gets an answer to each command within 1 ms."""
 
         def wait(is_there: Callable[[], bool], seconds: float) -> None:
             commands = self.take()
@@ -78,7 +78,7 @@ class Script:
         return self
 
     def state(self, a: str = REST, c: str = REST, line: int = 1, time: int = 100) -> DriveReply:
-        """Request the state, answer, and return that of the insertion axis."""
+        """Request the state, answer, and return the state of the insertion axis."""
         self.protocol.request(7)
         self.take()
         self.receive(STATE.format(a=a, c=c, line=line, time=time))
@@ -215,7 +215,7 @@ def test_the_watchdog_and_a_restart_show() -> None:
     script.run(script.protocol.clear_fault("rotation"))
     assert script.sent[-1] == "XQ#NSDOG,1"
     assert script.state(time=200) == script.state(time=300)
-    # The clock began anew, or the program has ended: until the next set-up.
+    # The clock restarted, or the program ended: lost until the next set-up.
     assert script.state(time=250).rebooted
     assert script.state(time=260).rebooted
     assert not script.set_up().state(time=270).rebooted

@@ -18,7 +18,7 @@ BEATS = (b",B*",)
 
 
 class Board:
-    """A protocol, and the far end of its line: answers by letter; None: silent."""
+    """A protocol, and the other end of its line: answers by letter; None: silent."""
 
     def __init__(self, *axes: str, **parameters: float | bool) -> None:
         settings = DeviceDriverParameters(**{**STEPS, **parameters})
@@ -82,7 +82,7 @@ def test_orders_and_a_request_have_these_bytes() -> None:
     protocol.request(7)
     (sent,) = board.link.pop_outgoing()
     assert sent == b"$0,P,0,1*4D\n$1,M,1,-250,20*55\n$2,H,0*4A\n$3,B*5D\n$4,S*4B\n"
-    # In pieces, after noise, and after a line that lost its checksum.
+    # In pieces, after noise, and after a line without its checksum.
     board.feed(b"\xff\n$4,S,0,9,9,9,9*00\n$4,S,0,800,2", b"1,-250,27", b"*73\n")
     assert board.statuses == [
         (

@@ -31,7 +31,7 @@ NEW = {
 
 
 class Line:
-    """A protocol, and the far end of its line: a table from command to data, None: rejected."""
+    """A protocol, and the other end of its line: a table from command to data, None: rejected."""
 
     def __init__(self, **parameters: Any) -> None:
         settings = DeviceDriverParameters(
@@ -286,7 +286,7 @@ COMPLETE = (
 )
 
 
-# Of either axis, and of either command.
+# For either axis, and for either command.
 @pytest.mark.parametrize("lost", [0, 3])
 @pytest.mark.parametrize(
     "instead",

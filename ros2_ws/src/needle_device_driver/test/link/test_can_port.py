@@ -1,6 +1,6 @@
 """CAN port on slcan over a pseudo-terminal, virtual and socketcand.
 
-The port's thread is not started: each test takes its steps, when what it waits for is there.
+The port's thread is not started: each test takes its steps as soon as their input is there.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Adapter:
         self.path = os.ttyname(self.slave)
 
     def read(self, wanted: bytes) -> bytes:
-        """Return the written data up to the wanted ones, or all."""
+        """Return the written data up to the expected end, or all."""
         data = b""
         while wanted not in data and select.select([self.master], [], [], 1.0)[0]:
             data += os.read(self.master, 4096)

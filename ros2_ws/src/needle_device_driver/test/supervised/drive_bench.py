@@ -107,7 +107,7 @@ class DriveBench(SupervisorBench):
         """Return the last set-point of a joint."""
         return self.axes[number].poll(self.now).set_point
 
-    # ---- ways into the middle of things ---------------------------------------------------------
+    # ---- states of the rig ----------------------------------------------------------------------
 
     def refusal(self) -> str:
         """Check that the set-up is refused without switching on; return the reason."""
@@ -169,7 +169,7 @@ class DriveBench(SupervisorBench):
         self.go()
 
     def obeys_late(self, drive: ScriptedDrive, seconds: float) -> None:
-        """Delay every command of a drive; then it is off [s]."""
+        """Delay the reaction of a drive to a command by some time [s]; then it is off."""
         due = math.inf
 
         def command(word: int) -> None:

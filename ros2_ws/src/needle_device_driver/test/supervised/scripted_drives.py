@@ -9,9 +9,9 @@ from needle_core.can_frame import CanFrame
 
 
 class ScriptedDrive:
-    """One CiA 402 drive as a script: what it answers to each frame, written from the standard.
+    """One CiA 402 drive as a script of the answer to each frame, written from the standard.
 
-    It moves ideally: at each SYNC it tells where it is, then it is at its set-point.
+    It moves ideally: at each SYNC it reports its position, then it is at its set-point.
     """
 
     STATES = {
@@ -57,7 +57,7 @@ class ScriptedDrive:
         # Modes that it accepts by SDO.
         self.modes = {6, 8}
         # Orders that it ignores; whether it answers to SYNC, and has heartbeats; counts that it
-        # goes at each SYNC by itself, in a state and while it homes.
+        # moves at each SYNC by itself, in a state and while it homes.
         self.ignored_orders: set[str] = set()
         self.syncs = self.beats = True
         self.drift: dict[str, int] = {}

@@ -40,7 +40,7 @@ class SupervisorBench(abc.ABC):
     def exchange(self) -> None:
         """Run the supervisor's cycle."""
 
-    # ---- what is told -------------------------------------------------------------------------
+    # ---- reports ------------------------------------------------------------------------------
 
     @property
     def state(self) -> str:
@@ -64,7 +64,7 @@ class SupervisorBench(abc.ABC):
 
     @property
     def rule(self) -> str:
-        """Name of the rule behind the last notice; empty: none."""
+        """Name of the rule behind the last notice; empty if there is none."""
         rules = [notice.rule for notice in self.notices]
         return rules[-1].value if rules and rules[-1] is not None else ""
 
@@ -77,7 +77,7 @@ class SupervisorBench(abc.ABC):
     def outcomes(self) -> list[str]:
         return [outcome for _, outcome in self.results]
 
-    # ---- what a person does -------------------------------------------------------------------
+    # ---- actions of a person ------------------------------------------------------------------
 
     def hold(
         self,

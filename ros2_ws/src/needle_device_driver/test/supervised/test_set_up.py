@@ -19,7 +19,7 @@ RANGE = 0x0609_0030
 COUNTS, COUNTS_2, RPM, RPM_S = 0x00B5_0300, 0x00B5_5700, 0x00B4_4700, 0x00C0_0300
 TURN = {(0x608F, 1): 20_000, (0x608F, 2): 1}
 IN_RPM = {(0x60A9, 0): RPM, (0x60AA, 0): RPM_S, **TURN}
-# 5 mm/s, 2 mm/s to the switch, a quarter of that off it; 50 mm/s^2, stops at 500 mm/s^2.
+# 5 mm/s, 2 mm/s to the switch, a quarter of that away from it; 50 mm/s^2, stops at 500 mm/s^2.
 SPEEDS = {(0x607F, 0): 100_000, (0x6081, 0): 100_000, (0x6099, 1): 40_000, (0x6099, 2): 10_000}
 RAMPS = {(0x6083, 0): 10**6, (0x6084, 0): 10**6, (0x609A, 0): 10**6, (0x6085, 0): 10**7}
 

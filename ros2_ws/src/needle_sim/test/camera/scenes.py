@@ -48,11 +48,11 @@ def render(renderer: StereoRenderer, plant: NeedlePlant | None, number: int) -> 
 
 
 def taken(with_it: Pair, without: Pair) -> np.ndarray:
-    """What something takes from both images; the same exposure has the same noise."""
+    """Return the darkening of both images by something; the same exposure has the same noise."""
     return np.asarray(np.stack(without).astype(float) - np.stack(with_it))
 
 
 def darkness(renderer: StereoRenderer, plant: NeedlePlant) -> np.ndarray:
-    """What the needle takes from each image, the mean of some exposures."""
+    """Return the darkening of each image by the needle, the mean of some exposures."""
     pairs = [taken(render(renderer, plant, n), render(renderer, None, n)) for n in range(2)]
     return np.asarray(np.mean(pairs, axis=0))

@@ -16,18 +16,16 @@ from needle_sim.camera.stereo_rig import StereoRig
 from .scenes import STILL, needle, render
 
 
-def test_a_shaft_mirrors_where_its_normal_halves_the_angle_and_is_dark_where_it_bends_away() -> (
-    None
-):
+def test_a_shaft_reflects_where_its_normal_bisects_the_angle_and_not_where_it_bends_away() -> None:
     camera, lamp = np.array([0.5, 0.0, 0.05]), np.array([0.4, 0.25, 0.05])
     line = np.linspace(0.0, 0.1, 200)[:, np.newaxis] * [0.0, 0.0, 1.0]
     share, place = lamp_reflection(line, camera, lamp, MetalShaft())
-    # Abreast of both, and nowhere else as much.
+    # Level with camera and lamp, and nowhere else as much.
     middle = int(np.argmax(share))
     assert line[middle, 2] == pytest.approx(0.05, abs=2e-3)
     assert share.max() == pytest.approx(1.0, abs=1e-3)
     assert share[0] < 0.9 * share.max()
-    # The lamp stands at y > 0, 0.56 rad beside the camera: half of that is the normal's turn.
+    # The lamp is at y > 0, 0.56 rad from the camera: the normal is turned by half of that.
     turn = np.arctan2(0.25, 0.4) / 2.0
     side = np.cross([0.0, 0.0, 1.0], camera - line[middle])[1]
     assert place[middle] == pytest.approx(np.sign(side) * np.sin(turn), abs=0.02)
@@ -38,7 +36,7 @@ def test_a_shaft_mirrors_where_its_normal_halves_the_angle_and_is_dark_where_it_
     assert lamp_reflection(up, camera, lamp, MetalShaft(spread=0.1))[0][-1] < 0.02
 
 
-def test_the_core_lies_on_the_lamp_s_side_in_the_image(rig: StereoRig) -> None:
+def test_the_core_is_on_the_side_of_the_lamp_in_the_image(rig: StereoRig) -> None:
     plant = needle(0.1, 0.0, 0.0, curvature=1e-3)
     scenario = dataclasses.replace(STILL, metal=MetalShaft(spread=0.5, core=250.0))
     checked = set()

@@ -23,7 +23,9 @@ def points_inside(count: int) -> np.ndarray:
     return np.random.default_rng(1).uniform(low, high, (count, 3))
 
 
-def test_without_refraction_on_the_surface_and_above_it_is_opencv_s_camera(rig: StereoRig) -> None:
+def test_projection_equals_opencv_without_refraction_and_on_or_above_the_surface(
+    rig: StereoRig,
+) -> None:
     inside = points_inside(50)
     on_it = np.column_stack([np.full(50, HEIGHT), inside[:, 1:]])
     for camera in (rig.left, rig.right):

@@ -40,7 +40,7 @@ def middles(dark: np.ndarray, columns: np.ndarray, rows: np.ndarray) -> np.ndarr
 @pytest.mark.parametrize("calibration", [CALIBRATION, TOP_AND_SIDE], ids=["above", "windows"])
 def test_the_shaft_is_darkest_where_its_path_projects(calibration: object) -> None:
     rig = load_stereo_rig(str(calibration))
-    # The path once more, from geometry: a circle in the entry pose's y-z plane, towards -y.
+    # The same path from geometry: a circle in the entry pose's y-z plane, towards -y.
     angle = np.linspace(0.01, 0.07, 400)[:, np.newaxis] * CURVATURE
     circle = np.hstack([0.0 * angle, np.cos(angle) - 1.0, np.sin(angle)]) / CURVATURE
     path = circle @ initial_pose(*np.deg2rad([2.0, 15.0]))[:3, :3].T
@@ -72,7 +72,7 @@ def test_the_needle_ends_at_the_tip(rig: StereoRig) -> None:
         assert np.polyval(line, 0.0) == pytest.approx(float(v), abs=0.1)
 
 
-def test_noise_is_the_scenario_s_and_new_in_every_exposure_camera_and_seed(rig: StereoRig) -> None:
+def test_noise_follows_the_scenario_and_differs_by_exposure_camera_and_seed(rig: StereoRig) -> None:
     rig = small(rig)
     for level in (3.0, 5.0):
         scenario = dataclasses.replace(CLEAN, noise=level)
@@ -140,7 +140,7 @@ def test_the_bend_turns_by_its_angle_and_ends_at_the_tip() -> None:
     line = NeedleShape().shaft_centreline(pose, plant.centreline(0.001), 0.0001)
     np.testing.assert_array_equal(line[-1], pose[:3, 3])
     local = (line - pose[:3, 3]) @ pose[:3, :3]
-    # Distal segment: leaning towards -y, straight, 9 mm.
+    # Distal segment: 9 mm, straight, leaning towards -y.
     direction = local[-1] - local[-50]
     direction /= np.linalg.norm(direction)
     lean = np.deg2rad(5.6)
@@ -158,7 +158,7 @@ def test_the_bend_turns_by_its_angle_and_ends_at_the_tip() -> None:
 def test_a_short_path_draws_only_the_part_inside() -> None:
     plant = needle(0.004, 0.0, 0.0)
     line = NeedleShape().shaft_centreline(plant.T_rig_tip, plant.centreline(0.001), 0.0003)
-    # As far as the bend lies beside the path.
+    # Up to where the bend is beside the path.
     assert line[0, 2] == pytest.approx(0.0, abs=5e-5)
     for length in (0.0, 1e-16, 1e-9):
         point = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, length]])

@@ -49,7 +49,7 @@ def place_at(height: float, pixel: np.ndarray, camera: SimulatedCamera) -> np.nd
 
 @pytest.fixture(scope="module", params=SCENARIOS)
 def renderers(rig: StereoRig, request: pytest.FixtureRequest) -> list[StereoRenderer]:
-    """Return a scenario's of seeds 5, 5 and 6."""
+    """Return the renderers of a scenario with seeds 5, 5 and 6."""
     scenario = SCENARIOS[request.param]
     return [StereoRenderer(small(rig), seed, scenario=scenario) for seed in (5, 5, 6)]
 
@@ -126,7 +126,7 @@ def test_the_shadow_lies_on_the_floor(rig: StereoRig) -> None:
     assert np.abs(right_rows(0.027)).min() > 3.0
 
 
-def test_blur_is_a_thin_lens_s_and_keeps_the_needle_s_darkness(rig: StereoRig) -> None:
+def test_blur_is_that_of_a_thin_lens_and_keeps_the_darkness_of_the_needle(rig: StereoRig) -> None:
     lens = Lens(focus_height=0.065, aperture=0.011)
     points = np.zeros((4, 3))
     points[:, 0] = [0.065, 0.0175, 0.0, -0.0175]
@@ -148,7 +148,7 @@ def test_blur_is_a_thin_lens_s_and_keeps_the_needle_s_darkness(rig: StereoRig) -
     assert profiles[1].max() < 0.7 * profiles[0].max()
 
 
-def test_events_come_in_every_stretch_and_in_every_kind() -> None:
+def test_events_of_every_kind_occur_in_every_interval() -> None:
     events = [occlusion_at(3, number) for number in range(20 + 40 * 30)]
     assert all(event is None for event in events[:20])
     kinds = set()

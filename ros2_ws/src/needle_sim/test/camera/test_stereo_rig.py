@@ -40,7 +40,7 @@ def test_each_camera_may_have_its_own_window() -> None:
         assert window.normal[axis] > 0.9999
         assert window.outer == pytest.approx(outer, abs=0.3e-3)
         assert (window.thicknesses, window.indices) == ((0.005,), (1.49, 1.34))
-        # The camera looks at its window.
+        # The camera faces its window.
         assert camera.T_optical_rig[2, axis] < -0.99
         assert float(window.height(camera.centre)) - window.outer == pytest.approx(0.5, abs=1e-3)
     assert rig.half_height == pytest.approx(0.0175, abs=0.3e-3)

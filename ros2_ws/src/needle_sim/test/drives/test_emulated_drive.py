@@ -11,7 +11,7 @@ from needle_sim.drives.cia402 import PowerState, next_state
 from .master import CSP, HM, INSERTION, MASTER, PP, ROTATION, Master
 
 # Shutdown, switch on, enable operation, disable voltage, quick stop: state to the states after
-# each, as the figure of CiA 402 has them.
+# each, as in the figure of CiA 402.
 WORDS = (0x06, 0x07, 0x0F, 0x00, 0x02)
 WAYS = {
     0x00: (0x00, 0x00, 0x00, 0x00, 0x00),
@@ -26,7 +26,7 @@ WAYS = {
 
 
 def run_at(master: Master, counts_per_sync: int) -> int:
-    """Go at a steady speed for ten SYNCs; return where the motor is then."""
+    """Move at a constant speed for ten SYNCs; return the position of the motor."""
     start = master.read(0x6064)
     for k in range(1, 11):
         master.target(start + counts_per_sync * k)
@@ -43,7 +43,7 @@ def test_the_power_state_goes_where_the_standard_says() -> None:
 
 
 def test_an_enabled_drive_moves_at_once_to_an_old_target(master: Master) -> None:
-    # Like a real drive: the driver must set the target to the present position before.
+    # Like a real drive: the driver must first set the target to the present position.
     master.target(500)
     master.write(0x6060, 0, CSP, 1)
     master.control(0x06, 0x07, 0x0F)
@@ -73,7 +73,7 @@ def test_a_lagging_motor_follows_and_arrives_exactly() -> None:
         master.target(800 * k)
         master.sync()
         if k > 5:
-            # v tau = 40 counts/ms x 5 ms, but for the last millisecond's share.
+            # v tau = 40 counts/ms x 5 ms, except for the share of the last millisecond.
             assert master.read(0x60F4) == pytest.approx(180, abs=30)
     master.sync(4)
     assert master.read(0x6064) == 800 * 15
@@ -115,7 +115,7 @@ def test_the_next_profile_target_waits_for_the_first_and_relative_ones_add(
         master.target(relative)
         master.control(0x0F, 0x5F)
     master.sync(200)
-    # Both relative to where the drive stood when they came.
+    # Both relative to the position of the drive when they arrived.
     assert master.read(0x6064) == 500
 
 
@@ -187,7 +187,7 @@ def test_a_quick_stop_brakes_on_its_ramp_and_stays(master: Master) -> None:
     rest = master.read(0x6064)
     assert rest - before == pytest.approx(800, abs=1)
     assert master.state() == 0x07
-    # Operation goes on only with a set-point: the old one is still there.
+    # Motion continues only with a new set-point: the old one is still stored.
     master.target(rest)
     master.control(0x0F)
     master.sync(10)

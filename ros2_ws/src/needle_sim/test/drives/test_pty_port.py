@@ -28,7 +28,7 @@ def computer(port: PtyCan) -> Any:
 
 
 def received(port: PtyCan) -> tuple[CanFrame, ...]:
-    """Return the frames that the adapter reads, in however many pieces they come."""
+    """Return the frames that the adapter reads, in any number of pieces."""
     frames: tuple[CanFrame, ...] = ()
     for _ in range(100):
         frames += port.receive()

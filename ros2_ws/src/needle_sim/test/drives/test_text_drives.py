@@ -1,4 +1,4 @@
-"""Base of the drives that speak lines: input, faults of the line, time, clients, and the server."""
+"""Base of the line-based drives: input, faults of the line, time, clients, and the server."""
 
 from __future__ import annotations
 

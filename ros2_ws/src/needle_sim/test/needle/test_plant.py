@@ -19,7 +19,7 @@ def needle(pitch: float = 0.03, roll: float = 0.2, **more: float | Torsion | Non
 
 
 def wandering(turns: np.ndarray = TURNS) -> NeedlePlant:
-    """Return a needle that has gone 1 mm with each turn."""
+    """Return a needle that was inserted by 1 mm with each turn."""
     plant = needle()
     for turned in turns:
         plant.advance(0.001, turned)
@@ -41,7 +41,7 @@ def coordinates_rate(_: float, q: np.ndarray, rotation_rate: float) -> np.ndarra
     )
 
 
-def test_the_plant_follows_the_paper_s_coordinate_equations() -> None:
+def test_the_plant_follows_the_coordinate_equations_of_the_paper() -> None:
     pitch, roll = np.deg2rad([2.0, 15.0])
     plant = needle(pitch, roll)
     q = np.array([0.0, 0.0, 0.0, 0.0, pitch, roll])
@@ -100,7 +100,7 @@ def test_splitting_a_step_changes_neither_pose_nor_torsion() -> None:
     assert float(parts.insertion) == pytest.approx(0.05)
 
 
-def test_retraction_returns_along_the_path_and_with_the_rotation_undone_the_whole_pose() -> None:
+def test_retraction_follows_the_path_back_and_undone_rotation_restores_the_pose() -> None:
     reference, poses = needle(), []
     for turned in TURNS:
         poses.append(reference.T_rig_tip)
@@ -108,7 +108,7 @@ def test_retraction_returns_along_the_path_and_with_the_rotation_undone_the_whol
     plant, undone = wandering(), wandering()
     for pose, turned in zip(poses[::-1], TURNS[::-1], strict=True):
         plant.advance(-0.001, 0.0)
-        # Position and heading are the path's; the tip is not turned back, for the base is not.
+        # Position and heading are those of the path; the tip is not turned back, nor is the base.
         np.testing.assert_allclose(plant.T_rig_tip[:3, 2:], pose[:3, 2:], rtol=0, atol=1e-13)
         undone.advance(-0.001, -turned)
         np.testing.assert_allclose(undone.T_rig_tip, pose, rtol=0, atol=1e-13)
@@ -120,7 +120,7 @@ def test_reinsertion_follows_the_channel_and_cuts_on_from_its_end() -> None:
     plant, straight_on = wandering(), wandering()
     plant.advance(-0.03, 0.0)
     assert len(plant.centreline(0.00099)) == 32
-    # 10 mm in the channel, 20 mm beyond.
+    # 10 mm in the channel, 20 mm beyond it.
     plant.advance(0.02, 0.0)
     plant.advance(0.03, 0.0)
     straight_on.advance(0.02, 0.0)

@@ -1,4 +1,4 @@
-"""Appearances: drawn by the seed, fixed by name, and their light on the sensor."""
+"""Appearances: drawn by the seed or fixed by name, and their light on the sensor."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_name_fixes_its_properties_and_the_seed_draws_the_others_in_full_range
         assert len({look.floor_level for look in looks}) == 5
 
 
-def test_a_floor_gives_back_a_share_of_the_light_and_repeats(
+def test_a_floor_reflects_a_share_of_the_light_and_repeats(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(floors, "_SHAPE", (500, 650))

@@ -32,7 +32,7 @@ TOP_AND_SIDE = load_stereo_rig(CALIBRATION.with_name("calibration_top_and_side.y
 
 @pytest.fixture(scope="module")
 def boxes(tmp_path_factory: pytest.TempPathFactory) -> list[StereoRig]:
-    """Return boxes drawn at random, seen by webcams."""
+    """Return random boxes in front of webcams."""
     path = tmp_path_factory.mktemp("boxes") / "box.yaml"
     rigs = []
     for seed in range(8):
@@ -47,14 +47,14 @@ def cameras(rigs: list[StereoRig]) -> Iterator[tuple[StereoRig, SimulatedCamera]
 
 
 def bent_line() -> tuple[np.ndarray, np.ndarray]:
-    """Return a middle line of curvature 8 / m in a slanting plane, and the side it bends to."""
+    """Return a centre line of curvature 8 / m in an oblique plane, and the side it bends to."""
     aside = np.array([0.6, 0.8, 0.0])
     angle = np.linspace(0.0, 0.4, 201)[:, np.newaxis]
     line = 0.125 * (np.sin(angle) * [0.0, 0.0, 1.0] + (1.0 - np.cos(angle)) * aside)
     return line, aside
 
 
-def test_a_pixel_s_ray_meets_the_point_projected_there(boxes: list[StereoRig]) -> None:
+def test_the_ray_of_a_pixel_meets_the_point_projected_there(boxes: list[StereoRig]) -> None:
     for rig, camera in cameras([RIG, TOP_AND_SIDE, *boxes]):
         columns = np.linspace(0.0, camera.image_width - 1.0, 9)
         lines = np.linspace(0.0, camera.image_height - 1.0, 7)
@@ -75,15 +75,15 @@ def test_a_box_is_seen_through_walls_that_end(boxes: list[StereoRig]) -> None:
         rays = refracted_rays(np.stack([column, row], axis=-1), camera, rig)
         inside = rays.origin[~rays.in_air]
         assert inside[:, 2].min() > 0.0
-        # Walls are a little out of square.
+        # The walls are slightly out of square.
         assert np.abs(inside @ other.window.normal).max() < other.window.inner + 1e-3
-        # Beside its walls a line of sight goes straight on from the camera.
+        # A line of sight beside the walls continues straight from the camera.
         beside = rays.origin[rays.in_air] - camera.centre
         away = np.cross(beside, rays.direction[rays.in_air])
         assert np.abs(away).max(initial=0.0) < 1e-12
 
 
-def test_before_the_phantom_rays_go_straight_on() -> None:
+def test_rays_are_straight_in_front_of_the_phantom() -> None:
     rays = refracted_rays([[5.0, 300.0], [500.0, 300.0]], RIG.left, RIG)
     assert rays.origin[0, 2] < 0.0 < rays.origin[1, 2]
     from_centre = rays.origin - RIG.left.centre
@@ -101,7 +101,7 @@ def test_the_mesh_has_its_diameter_and_its_end(hollow: bool) -> None:
     needle = needle_mesh(line, aside, look)
     heading = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
     assert look.bevel_length == pytest.approx(0.0012124, abs=1e-7)
-    # Beside the axis's end, on the side it bends to, and level with it.
+    # Beside the end of the axis, on the side of the bend, and level with it.
     away = needle.extreme - line[-1]
     assert np.linalg.norm(away) == pytest.approx(0.00035, abs=1e-8)
     assert abs(away @ heading) < 1e-6
@@ -163,7 +163,7 @@ def test_a_box_stands_in_front_of_its_background(boxes: list[StereoRig]) -> None
         assert behind.depth == -look.floor_height
 
 
-def test_lamps_stand_above_and_seem_higher() -> None:
+def test_lamps_are_above_and_appear_higher() -> None:
     for kind in LAMPS:
         for seed in range(5):
             for lamp in place_lamps(kind, np.random.default_rng(seed)):

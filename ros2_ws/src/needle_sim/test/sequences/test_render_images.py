@@ -37,7 +37,7 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def test_the_folder_holds_what_was_rendered(tmp_path: Path) -> None:
+def test_the_folder_contains_the_rendered_images(tmp_path: Path) -> None:
     output, done = tmp_path / "new" / "images", tmp_path / "done.json"
     words = ["--scenario", "clean", "--frames", "2", "--seed", "7", "--step-mm", "9"]
     assert main(arguments(output, *words, "--json", str(done))) == 0
@@ -99,7 +99,7 @@ def test_a_phantom_without_a_possible_path_is_reported(monkeypatch: pytest.Monke
         random_path(0, 0.12, (0.0041, math.inf), 1.0 / 0.122)
 
 
-def test_truth_s_angles_give_the_directions_back() -> None:
+def test_angles_of_the_truth_give_the_directions_back() -> None:
     plant = NeedlePlant(initial_pose(0.3, 0.8), curvature=8.2)
     plant.advance(0.06, 0.5)
     pose = plant.T_rig_tip

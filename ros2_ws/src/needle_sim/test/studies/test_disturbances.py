@@ -32,12 +32,12 @@ def error(disturbances: Disturbances, exposure: int = 1, seed: int = 1) -> Float
 
 
 def fits(sample: FloatArray, spread: Any) -> bool:
-    """Tell whether numbers have a distribution: of these p is uniform, 1e-4 is one in 10,000."""
+    """Return whether numbers have a distribution: then p is uniform, and < 1e-4 once in 10,000."""
     return bool(stats.kstest(sample.ravel(), spread.cdf, method="asymp").pvalue > 1e-4)
 
 
 def check_isotropic(off: FloatArray) -> None:
-    """Check that vectors go in any direction: on the sphere each coordinate is uniform."""
+    """Check that vectors have any direction: each coordinate on the sphere is uniform."""
     unit = off / np.linalg.norm(off, axis=1)[:, np.newaxis]
     for coordinate in unit.T:
         assert fits(coordinate, stats.uniform(-1.0, 2.0))
@@ -58,7 +58,7 @@ def test_noise_has_its_distribution_and_is_independent(shape: str, spread: Any) 
     assert fits(off, spread)
     others = (error(noise, exposure=2), error(noise, seed=2))
     columns = np.column_stack([off, *others])
-    # By rank: Student's t has no fourth moment.
+    # By rank, because Student's t has no fourth moment.
     assert np.all(np.abs(stats.spearmanr(columns).statistic - np.eye(9)) < FIVE)
     np.testing.assert_array_equal(error(Disturbances(noise_shape=shape)), 0.0)
 
@@ -75,7 +75,7 @@ def test_noise_that_lasts_has_its_amplitude_and_correlation_at_every_exposure(
         np.testing.assert_allclose(found, wanted, atol=0.05)
 
 
-def test_outliers_are_so_many_so_far_off_in_any_direction() -> None:
+def test_outliers_have_the_requested_share_and_distance_in_any_direction() -> None:
     off = error(Disturbances(noise=0.001, outliers=0.3))
     size = np.linalg.norm(off, axis=1)
     far = size > 0.002
@@ -87,19 +87,19 @@ def test_outliers_are_so_many_so_far_off_in_any_direction() -> None:
     assert 0.00349 < size.max() <= 0.0035
 
 
-def test_dropped_tips_are_missing_whole_and_the_others_untouched() -> None:
+def test_dropped_tips_are_missing_completely_and_others_unchanged() -> None:
     kept = measured(TIPS, Disturbances(noise=0.001), 1, 1, 0)
     seen = measured(TIPS, Disturbances(noise=0.001, found=0.8), 1, 1, 0)
     missing = np.isnan(seen)
     assert np.all(missing.all(axis=1) == missing.any(axis=1))
     assert abs(np.mean(missing[:, 0]) - 0.2) < FIVE * np.sqrt(0.2 * 0.8)
     np.testing.assert_array_equal(seen[~missing], kept[~missing])
-    # The first tip is there, and no outlier.
+    # The first tip is never missing, and never an outlier.
     all_wrong = Disturbances(noise=0.001, outliers=1.0, found=0.0)
     assert np.all(np.abs(error(all_wrong, exposure=0)) <= 0.001 + 1e-12)
 
 
-def test_bumps_are_of_one_size_in_any_direction_and_patches_uniform_and_anew() -> None:
+def test_bumps_have_one_size_in_any_direction_and_patches_are_uniform_and_independent() -> None:
     moved = bumps(0.002, 1, 0, COUNT)
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 0.002, rtol=1e-9)
     check_isotropic(moved)
@@ -109,7 +109,7 @@ def test_bumps_are_of_one_size_in_any_direction_and_patches_uniform_and_anew() -
     assert np.all(np.abs(np.corrcoef(factors) - np.eye(3)) < FIVE)
 
 
-def test_pushes_are_across_z_in_any_direction_and_roll_steps_normal_and_anew() -> None:
+def test_pushes_are_across_z_in_any_direction_and_roll_steps_normal_and_independent() -> None:
     axes = push_axes(2.0, 1, 0, COUNT)
     np.testing.assert_allclose(np.linalg.norm(axes[:, :2], axis=1), 2.0)
     np.testing.assert_array_equal(axes[:, 2], 0.0)
@@ -128,10 +128,10 @@ def test_a_bias_walks_by_tenths_within_its_bounds_and_stays_spread_evenly() -> N
     steps = np.diff(bias, axis=0)
     inside = np.abs(bias[:-1]) < 0.0009
     np.testing.assert_allclose(np.abs(steps[inside]), 0.0001, atol=1e-12)
-    # Up as often as down, whatever the step before.
+    # Up and down equally often, whatever the previous step.
     assert abs(np.mean(steps > 0.0) - 0.5) < 0.01
     assert abs(np.corrcoef(steps[0].ravel(), steps[1].ravel())[0, 1]) < FIVE + 0.1
-    # Each needle's own, wherever a part begins.
+    # Each needle has its own, wherever a part begins.
     np.testing.assert_array_equal(BiasWalk(0.001, 1, 41, 5).at(1), bias[1, 41:46])
 
 
@@ -147,7 +147,7 @@ def test_a_late_measurement_has_its_age(steps: int) -> None:
             assert age == pytest.approx(0.001 * steps)
 
 
-def test_a_needle_s_numbers_do_not_depend_on_its_company() -> None:
+def test_random_numbers_of_a_needle_do_not_depend_on_other_needles() -> None:
     for first in (40, 41):
         for purpose in (NOISE, CURVATURE):
             whole = uniform_numbers(3, purpose, 7, 0, 100)

@@ -68,7 +68,7 @@ def test_figures_of_known_runs() -> None:
     np.testing.assert_allclose(concatenate(parts).x_end, [0.0, 0.001, 0.002])
 
 
-def test_ends_that_are_far_off_and_trusted_are_counted_on_both_sides() -> None:
+def test_distant_ends_with_high_confidence_are_counted_on_both_sides() -> None:
     distance = np.array([0.0, 0.0049, 0.0051, -0.0051, -0.02])
     assert trusted_far_off(distance, np.zeros(5)) == 3.0
     assert trusted_far_off(distance, np.array([0.0, 0.0, 1.0, 0.0, 1.0])) == 1.0
@@ -76,7 +76,7 @@ def test_ends_that_are_far_off_and_trusted_are_counted_on_both_sides() -> None:
 
 
 def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:
-    # Off by 1, 2.5 and 4 standard deviations in x; by none, none and 2.5 in sin(pitch).
+    # Errors of 1, 2.5 and 4 standard deviations in x; of 0, 0 and 2.5 in sin(pitch).
     tally = ConsistencyTally(3)
     truth = np.array([0.001, 0.0025, 0.004]), np.arcsin([0.0, 0.0, 0.025])
     level, std = np.zeros(3), np.full(3, 0.001)
@@ -84,7 +84,7 @@ def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:
     assert np.all(np.isnan(tally.inside))
     tally.add(Belief(level, std, level, 10.0 * std), *truth)
     np.testing.assert_allclose(tally.inside, [[1.0, 0.5, 0.0], [1.0, 1.0, 0.5]])
-    # Of x alone
+    # Of x alone.
     np.testing.assert_allclose(tally.x_inside, [1.0, 1.0, 0.0])
     assert np.all(np.isnan(tally.missed))
     assert np.all(np.isnan(is_doubtful(tally.missed)))

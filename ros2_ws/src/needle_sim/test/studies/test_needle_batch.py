@@ -8,7 +8,7 @@ from needle_sim.needle.tissue import Torsion
 from needle_sim.studies.needles import NeedleBatch
 
 
-# Up to 2 rad a step: both the series and the closed form beyond it.
+# Up to 2 rad per step: both the series and the closed form beyond it.
 @pytest.mark.parametrize(
     ("largest_turn", "torsion"), [(1e-9, (0.0, 0.0)), (0.5, (0.0, 0.0)), (2.0, (0.3, 0.008))]
 )

@@ -31,7 +31,7 @@ STARTS = GRIDS["random"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)),
 STRAIGHT = StudySettings(1e-6, 0.150, STEP_LENGTH, Disturbances(), seed=1)
 
 
-def test_targets_lie_where_an_arc_of_the_allowed_curvature_leads_and_follow_the_seed() -> None:
+def test_targets_are_at_the_end_of_an_allowed_arc_and_follow_the_seed() -> None:
     targets = random_targets(STARTS, CURVATURE, 3)
     angles = np.column_stack([np.zeros(len(STARTS)), STARTS[:, 1:]])
     off = targets - np.column_stack([STARTS[:, 0], np.zeros((len(STARTS), 2))])
@@ -71,7 +71,7 @@ def test_targets_drift_and_breathe_independent_of_the_selection() -> None:
 
 
 class Straight:
-    """Does not turn; ends where the measured tip has come to a plane across the insertion."""
+    """Does not turn; ends when the measured tip reaches a plane across the insertion."""
 
     def __init__(self) -> None:
         self._targets = self._left = np.zeros(0)
@@ -121,13 +121,13 @@ def test_each_needle_ends_at_its_own_point_with_a_short_last_step() -> None:
     assert seen["max_point_mm"] == pytest.approx(2.0, abs=1e-3)
     apart = run_point_study(np.zeros((2, 3)), targets, Straight, STRAIGHT, chunk=1)
     np.testing.assert_allclose(apart.error, found.error, atol=1e-9)
-    # None goes beyond the depth.
+    # No needle goes beyond the depth.
     shallow = dataclasses.replace(STRAIGHT, depth=0.0155)
     found = run_point_study(np.zeros((2, 3)), targets, Straight, shallow)
     assert found.error[1] == pytest.approx(np.hypot(0.002, 0.0048), abs=1e-6)
 
 
-def test_best_comes_to_points_that_drift_and_breathe() -> None:
+def test_best_reaches_points_that_drift_and_breathe() -> None:
     noisy = StudySettings(CURVATURE, 0.150, STEP_LENGTH, Disturbances(noise=0.001), seed=7)
     places = random_targets(STARTS, CURVATURE, 7)
     near = np.argsort(places[:, 2])[:5]

@@ -20,7 +20,7 @@ FREE = np.zeros((0, 7))
 
 
 def steered(rate: Callable[[FloatArray], float], length: float) -> tuple[float, float]:
-    """Return an exact needle's miss and its least distance from the ball [m]."""
+    """Return the miss of an exact needle and its least distance from the ball [m]."""
     plant, least = NeedlePlant(initial_pose(0.02, 0.3), curvature=CURVATURE), 1.0
     pose = plant.T_rig_tip
     while (ahead := float(pose[:3, 2] @ (TARGET - pose[:3, 3]))) > 1e-5:
@@ -35,19 +35,19 @@ def sliding(pose: FloatArray) -> float:
     return float(sliding_mode_rate(pose[:3, :3].T @ (TARGET - pose[:3, 3]), RATE))
 
 
-def test_sliding_mode_turns_the_bevel_the_shorter_way_and_comes_as_near_as_published() -> None:
+def test_sliding_mode_takes_the_shorter_turn_and_is_as_accurate_as_published() -> None:
     for aside in ((1.0, 0.0), (-1.0, 0.0), (0.5, -2.0), (-0.1, 1.0)):
         plant = NeedlePlant(initial_pose(0.0, 0.0), curvature=CURVATURE)
         target = np.array([*aside, 50.0]) * 1e-3
         plant.advance(0.0, float(sliding_mode_rate(target, RATE)) * 1e-4)
         towards = np.array(aside) / np.hypot(*aside)
         assert -plant.T_rig_tip[:2, 1] @ towards > np.array([0.0, -1.0]) @ towards
-    # At 30 deg/mm and this curvature the bound is 0.41 mm, in steps far shorter than a turn.
+    # At 30 deg/mm and this curvature the bound is 0.41 mm, for steps far shorter than a turn.
     assert steered(sliding, 2e-4)[0] < 0.00041
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_a_duty_cycle_spins_for_the_share_that_is_not_to_bend(share: float) -> None:
+def test_a_duty_cycle_spins_for_the_straight_share(share: float) -> None:
     cycle, steps = DutyCycle(RATE, STEP), 600
     ahead = np.array([[0.0, -1.0, share]])
     turned = sum(abs(float(cycle.rates(ahead)[0])) * STEP for _ in range(steps))

@@ -76,7 +76,7 @@ def watched(needle: FloatArray, **changes: Any) -> tuple[Watching, Outcomes]:
 
 
 @pytest.mark.parametrize(("name", "share"), [("endpoint", 1.0), ("cell", 0.9)])
-def test_a_grid_is_uniform_within_its_convention_s_bounds(name: str, share: float) -> None:
+def test_a_grid_is_uniform_within_the_bounds_of_its_convention(name: str, share: float) -> None:
     points, counts = np.unique(GRIDS[name](BOUNDS, 3, 1), axis=0, return_counts=True)
     assert points.shape == (1000, 3)
     assert set(counts) == {3}
@@ -98,7 +98,7 @@ def test_random_starts_are_uniform_within_the_bounds_and_follow_the_seed() -> No
     assert not np.any(np.all(starts == GRIDS["random"](BOUNDS, 2, 2), axis=1))
 
 
-def test_not_steered_the_needle_ends_where_its_arc_takes_it() -> None:
+def test_an_unsteered_needle_ends_at_the_end_of_its_arc() -> None:
     # In closed form: x = x0 + sin(pitch) sin(kl)/k + cos(pitch) sin(roll) (1 - cos(kl))/k.
     start = np.array([[-0.003, np.deg2rad(2.0), np.deg2rad(15.0)]])
     bend, (_, pitch, roll) = CURVATURE * 0.120, start[0]
@@ -132,7 +132,7 @@ def cross(vector: FloatArray) -> FloatArray:
     return np.cross(vector, np.eye(3), axisb=0, axisc=0)
 
 
-def test_a_pushed_needle_goes_where_the_linear_equations_of_its_motion_lead() -> None:
+def test_a_pushed_needle_follows_its_linear_equations_of_motion() -> None:
     """R' = W R + R B and p' = R e3 are linear in (R, p): one matrix exponential solves them."""
     push, gain, turn, length = 2.0, 0.8, 20.0, 0.120
     wrong = Disturbances(push=push, rotation_gain=gain)
@@ -158,7 +158,7 @@ def test_a_pushed_needle_goes_where_the_linear_equations_of_its_motion_lead() ->
     np.testing.assert_allclose(alone.true.T_rig_tip[:, 2, 2], np.cos(push * length), atol=1e-12)
 
 
-def test_a_layer_bends_the_needle_otherwise_from_where_it_begins() -> None:
+def test_a_layer_changes_the_curvature_from_its_beginning() -> None:
     _, found = watched(LEVEL, depth=0.100, disturbances=Disturbances(layer=(0.3, 0.06)))
     first, second = CURVATURE * 0.06, 0.3 * CURVATURE * 0.04
     expected = (1.0 - np.cos(first)) / CURVATURE
@@ -166,7 +166,7 @@ def test_a_layer_bends_the_needle_otherwise_from_where_it_begins() -> None:
     assert found.x_end[0] == pytest.approx(expected, abs=1e-9)
 
 
-def test_the_roll_wanders_by_the_root_of_the_insertion_and_a_bias_is_seen_alone() -> None:
+def test_the_roll_drifts_by_the_root_of_the_insertion_and_a_bias_is_only_measured() -> None:
     count = 4000
     wrong = Disturbances(roll_walk=1.0, bias_walk=0.0003, slip=0.25)
     needles = DisturbedNeedles(
@@ -180,7 +180,7 @@ def test_the_roll_wanders_by_the_root_of_the_insertion_and_a_bias_is_seen_alone(
         off = seen - needles.true.tips
         np.testing.assert_allclose(off, bias.at(step + 1), atol=1e-15)
     turned = np.arctan2(needles.true.T_rig_tip[:, 1, 0], needles.true.T_rig_tip[:, 0, 0])
-    # 1 rad/sqrt(m) over 20 mm of stage, of which 16 mm are cut; five standard errors.
+    # 1 rad/sqrt(m) over 20 mm of the stage, of which 16 mm cut tissue; five standard errors.
     wanted = np.sqrt(0.016)
     assert abs(np.std(turned) / wanted - 1.0) < 5.0 / np.sqrt(2.0 * count)
     assert abs(np.mean(turned)) < 5.0 * wanted / np.sqrt(count)

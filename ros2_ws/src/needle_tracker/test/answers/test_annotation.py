@@ -1,4 +1,4 @@
-"""Answers for a person and as a message: picture, reasons, counts, orientation."""
+"""Answers as a picture and as a message: reasons, counts, orientation."""
 
 from __future__ import annotations
 

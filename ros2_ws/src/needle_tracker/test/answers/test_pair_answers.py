@@ -1,4 +1,4 @@
-"""Pairs that wait, that have no answer, and that are suspected to be swapped."""
+"""Pairs that wait, that get no answer, and that may be swapped."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TIMEOUT = 0.1
 
 
 class Answering:
-    """Pairs and joint states in; the stamps of answered pairs with the insertions given to them."""
+    """Pair answers under test; `given` has the insertion of each answered stamp."""
 
     def __init__(self, answers: PairAnswers) -> None:
         self.answers = answers
@@ -87,14 +87,14 @@ def test_a_pair_waits_for_the_joint_state_that_follows_it(answering: Answering) 
 @pytest.mark.parametrize(
     ("arrivals", "answered"),
     [
-        # Which topic was heard first is no matter.
+        # The order of the topics does not matter.
         ("p10 p20 p30 j20 j40", {20: 0.020, 30: 0.030}),
         ("j20 j40 p10 p20 p30", {20: 0.020, 30: 0.030}),
         ("p10 j20 p20 j40 p30", {20: 0.020, 30: 0.030}),
-        # A stamp that runs backwards begins a new history.
+        # A stamp that goes back starts a new history.
         ("j100 j200 j50 j80 p40 p60", {60: 0.060}),
         ("j100 j200 p40 p60 j50 p70 j80", {70: 0.070}),
-        # Without joint states, at first or for good, nothing is left out.
+        # Without joint states, at first or from now on, every pair is answered.
         ("p10 p20 wait p30", {10: None, 20: None, 30: None}),
         ("p10 wait j20 p15 p25 j30", {10: None, 25: 0.025}),
         ("j20 p30 wait p10 p40", {30: None, 10: "time of exposure ran backwards", 40: None}),
@@ -112,7 +112,7 @@ def test_a_pair_exposed_before_the_first_joint_state_has_no_answer(
     assert answering.given == answered
 
 
-def test_the_first_joint_state_is_known_when_it_is_no_longer_kept(answering: Answering) -> None:
+def test_the_first_joint_state_counts_after_it_was_dropped(answering: Answering) -> None:
     for stamp in range(100, 5000):
         answering.joint(stamp)
     answering.pair(99)
@@ -127,7 +127,7 @@ MISSED = Measurement(None, TrackState.SEARCHING, "no needle")
 
 
 class Other:
-    """In place of the second tracker: what it finds, and what it was asked."""
+    """Stand-in for the second tracker, with a settable result and counters of its calls."""
 
     def __init__(self, *_: Any) -> None:
         self.finds, self.looks, self.resets = True, 0, 0

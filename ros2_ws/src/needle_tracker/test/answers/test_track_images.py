@@ -1,4 +1,4 @@
-"""track_images: what comes out of folders and videos, and what is refused in one line."""
+"""track_images: results of folders and videos, and one-line errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SIGMA = 1e-4
 
 
 class Scripted:
-    """In place of the tracker: the tip is as far as an image is bright [mm], 3 mm is the entry."""
+    """Stand-in for the tracker: an image's brightness is the tip's depth [mm]; entry at 3 mm."""
 
     made: list[StereoTrackerParameters]
     references: list[Any]
@@ -81,7 +81,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def track(folder: Path, calibration_path: Path) -> Callable[..., tuple[int, list[dict[str, str]]]]:
-    """Run the command on the folder; bare names of files are in it."""
+    """Run the command in the folder; bare file names are in it."""
 
     def run(*more: str) -> tuple[int, list[dict[str, str]]]:
         output = folder / "tips.csv"
@@ -118,7 +118,7 @@ def test_every_pair_has_a_line_and_unusable_images_are_named(
     code, rows = track("--insertion", "insertion.csv", "--json", "o.json")
     assert code == 0
     assert [row["name"] for row in rows] == [f"image_{mm}.png" for mm in (3, 50, 51, 52, 60)]
-    # 3 mm: known from the stage alone, which is no measurement.
+    # 3 mm follows from the stage alone, which is not a measurement.
     assert [row["valid"] for row in rows] == ["0", "1", "0", "0", "0"]
     told = [row["missing"] for row in rows]
     unusable = ["left image is unreadable or not of 8 bit"]
@@ -136,7 +136,7 @@ def test_every_pair_has_a_line_and_unusable_images_are_named(
     told = json.loads((folder / "o.json").read_text())
     assert (told["pairs"], told["tips"], told["without_insertion"]) == (5, 1, 1)
     assert (told["unpaired"], told["unreadable"], told["compared"]) == (1, 2, None)
-    # From 3 to 50 mm is no run of one needle.
+    # Images at 3 and 50 mm are not one sequence of a needle.
     assert len(Scripted.resets) == 1
 
 
@@ -214,7 +214,7 @@ def test_wrong_options_are_reported_in_one_line(track: Track, folder: Path, caps
 
 
 def test_videos_are_read(track: Track, folder: Path) -> None:
-    # Without loss; a codec that every OpenCV has.
+    # A lossless codec that every OpenCV has.
     path, codec = folder / "both.avi", cv2.VideoWriter.fourcc(*"FFV1")
     video = cv2.VideoWriter(str(path), codec, 10.0, (1024, 768), False)
     for mm in (50, 51):
@@ -227,7 +227,7 @@ def test_videos_are_read(track: Track, folder: Path) -> None:
 
 
 def test_tips_are_compared_with_the_truth(track: Track, folder: Path, capsys: Out) -> None:
-    # 50 is right, 51 is 1 mm off, there is no needle in 3 and 52, and 60 is not told.
+    # 50 is right, 51 is wrong by 1 mm, 3 and 52 have no needle, and 60 has no truth.
     lines = ["image_50.png,0,0,0.05", "image_51.png,0,0,0.052", "image_52.png,,,", "image_3.png,,,"]
     for side in ("left", "right"):
         save(folder / side / "image_60.png", 60)
@@ -239,7 +239,7 @@ def test_tips_are_compared_with_the_truth(track: Track, folder: Path, capsys: Ou
     assert [told[key] for key in keys] == [2, 0, 1, 1]
     assert told["error_rms_mm"] == told["error_z_rms_mm"] == pytest.approx(math.sqrt(0.5))
     assert (told["error_max_mm"], told["error_x_rms_mm"]) == pytest.approx((1.0, 0.0))
-    # A millimetre is ten of its standard deviations.
+    # A millimetre is ten standard deviations.
     assert told["error_sigmas"] == pytest.approx(math.sqrt(100.0 / 2.0 / 3.0))
     assert told["inside_95"] == 0.5
     assert "error  0.707 mm rms" in capsys.readouterr().out

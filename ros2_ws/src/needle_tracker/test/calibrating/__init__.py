@@ -1,1 +1,1 @@
-"""Calibration: its tests, and the rig of their own that they calibrate."""
+"""Tests of the calibration, and the synthetic rigs that they calibrate."""

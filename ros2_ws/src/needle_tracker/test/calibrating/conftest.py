@@ -1,4 +1,4 @@
-"""Rigs that are known, what they see of boards, and what was calibrated from it, once for all."""
+"""Rigs with known parameters, their views of boards, and their calibrations, computed once."""
 
 from __future__ import annotations
 

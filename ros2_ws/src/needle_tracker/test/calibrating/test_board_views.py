@@ -1,4 +1,4 @@
-"""From images in folders, or of several exposures, to what both cameras saw of the board."""
+"""Views of the board in both cameras, from images in folders or several exposures."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_board_at_rest_is_averaged_over_its_exposures() -> None:
     assert view.place is SESSION.places["top"]
     numbers, pixels = SMALL.find(IMAGE)
     np.testing.assert_allclose(view.left.pixels, pixels + np.array([0.5, 0.0]), atol=0.02)
-    # A corner that half of the exposures show is not kept.
+    # A corner found in only half of the exposures is dropped.
     assert 0 < len(view.right.points) < len(numbers)
     blank = np.full_like(IMAGE, 90)
     with pytest.raises(UserError, match="no image shows the session's board"):

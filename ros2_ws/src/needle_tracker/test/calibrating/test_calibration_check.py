@@ -1,4 +1,4 @@
-"""What is silent in the images of a needle is loud in those of a target of known place."""
+"""Errors that do not show in images of a needle show in images of a target at a known place."""
 
 from __future__ import annotations
 

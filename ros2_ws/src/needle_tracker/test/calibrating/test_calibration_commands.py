@@ -1,4 +1,4 @@
-"""calibrate_stereo and check_calibration: from what was seen to files, words and exit codes."""
+"""calibrate_stereo and check_calibration: files, text and exit codes for given views."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def arguments(tmp_path: Path) -> list[str]:
 def seen(
     views: list[BoardView], result: RigCalibration, monkeypatch: Patch
 ) -> dict[str, list[BoardView]]:
-    """What both commands find in the images; the views with which is calibrated."""
+    """Views that both commands find in the images, and those used for the calibration."""
     nothing = dataclasses.replace(views[0].without("left").without("right"), name="blurred")
     found = {"views": [*views, nothing], "used": list[BoardView]()}
 
@@ -72,7 +72,7 @@ def test_a_written_calibration_passes_its_check(
         "NOT DETERMINED by these views, kept as given: 0)",
     ):
         assert line in text
-    # Where neither camera sees the board there is nothing to calibrate from.
+    # Views in which neither camera sees the board are left out.
     assert "left out, no board found: blurred" in text
     assert [view.name for view in seen["used"]] == [view.name for view in seen["views"][:-1]]
     assert load_calibration(output).left.window.inside == pytest.approx(1.3, abs=0.003)

@@ -1,4 +1,4 @@
-"""What a session file says, and what it may not say."""
+"""Session files: valid and invalid content."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def entry(place: Place) -> dict[str, Any]:
 
 
 def box_content(**places: Any) -> dict[str, Any]:
-    """A session file with a window for each camera in place of the phantom."""
+    """Return a session file with a window for each camera instead of the phantom."""
     said = session_content(**places)
     del said["phantom"]
     for side, window in zip(SIDES, GIVEN_BOX, strict=True):
@@ -89,7 +89,7 @@ def test_a_wrong_place_is_named() -> None:
         with pytest.raises(UserError, match=says):
             parse_session(session_content(a=place))
     for place, says in (
-        # In a box. Level, its print up: the camera beside sees its edge.
+        # In a box, level, print up: the camera at the side sees the board edge-on.
         ({"origin": [0.0, -0.04, 0.01]}, "away from the camera"),
         ({"origin": [0.03, -0.01, 0.01], "rows": [-1, 1, 0]}, "above the surface"),
     ):

@@ -1,4 +1,4 @@
-"""The board: found where it is drawn, printed at its size."""
+"""The board: detected where it is drawn, and printed at its size."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_corners_are_found_where_they_are_drawn() -> None:
     # Column and row numbers count rightwards and downwards from the first square.
     expected = 60 * board.corners[:, :2] / board.square + 40 - 0.5
     np.testing.assert_allclose(pixels, expected, atol=0.02)
-    # Of a part of the board, its corners; of no board, none.
+    # A partly visible board gives its visible corners; no board gives none.
     hidden = np.full_like(blurred, 200)
     numbers, pixels = board.find(hidden)
     assert (len(numbers), pixels.shape) == (0, (0, 2))
@@ -51,9 +51,9 @@ def test_the_printed_board_has_its_true_size(tmp_path: Path) -> None:
     assert image is not None
     numbers, pixels = SMALL.find(np.asarray(image, dtype=np.uint8))
     assert len(numbers) == 12
-    # 600 dots an inch.
+    # 600 dots per inch.
     np.testing.assert_allclose(np.ptp(pixels, axis=0) * 0.0254 / 600, [0.03, 0.02], atol=8e-6)
-    # Modules too are where OpenCV has them.
+    # The modules are also where OpenCV has them.
     expected = cv2.resize(board_image(SMALL, 60), None, fx=0.4, fy=0.4)
     margin = round(0.01 / 0.0254 * 600)
     printed = cv2.resize(image[margin:-margin, margin:-margin], expected.shape[::-1])

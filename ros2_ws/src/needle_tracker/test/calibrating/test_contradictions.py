@@ -1,4 +1,4 @@
-"""Squares and places given wrong, and pairs not taken at once: they hardly show in the errors."""
+"""Wrong squares and places, and pairs not captured at once, which hardly change the residuals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from synthetic_rig import GIVEN, PLACES, SIZES, free_pose, lenses_of, take, view
 
 
 def said_larger(views: list[BoardView], share: float) -> list[BoardView]:
-    """Views of a board whose squares are said to be larger than they are."""
+    """Return views of a board whose squares are stated larger than they are."""
     return [
         dataclasses.replace(
             view,
@@ -36,7 +36,7 @@ def said_larger(views: list[BoardView], share: float) -> list[BoardView]:
 def test_wrong_squares_are_found_by_their_size(
     views: list[BoardView], calibration: StereoCalibration
 ) -> None:
-    """0.3 % is 0.4 mm at the tip, and 0.01 px more reprojection error."""
+    """An error of 0.3 % is 0.4 mm at the tip, but only 0.01 px more reprojection error."""
     result = calibrate(said_larger(views[4:], 0.003), SIZES, GIVEN, lenses_of(calibration))
     error, sigma = square_error(result)
     assert error == pytest.approx(-0.003, abs=max(4.0 * sigma, 3e-4))
@@ -57,7 +57,7 @@ def test_one_place_does_not_determine_the_size_of_the_squares(
 @pytest.mark.parametrize(
     ("name", "shift", "says"),
     [
-        # Index and surface take most of it, and tips are as wrong.
+        # Index and surface absorb most of the error, so tips are equally wrong.
         ("under_deep", [1e-3, 0.0, 0.0], "under_deep is 0."),
         ("surface_b", [0.0, 0.0, 2e-3], "check its place"),
     ],
@@ -98,7 +98,7 @@ def many(rig: StereoRig) -> list[BoardView]:
 
 
 def swapped(views: list[BoardView], partner: dict[int, int]) -> list[BoardView]:
-    """Views whose right images are those of others."""
+    """Return views whose right images are those of other views."""
     return [
         dataclasses.replace(view, right=views[partner.get(number, number)].right)
         for number, view in enumerate(views)
@@ -106,7 +106,7 @@ def swapped(views: list[BoardView], partner: dict[int, int]) -> list[BoardView]:
 
 
 def moved(rig: StereoRig, views: list[BoardView], numbers: set[int]) -> list[BoardView]:
-    """Views whose board moved by 0.3 mm between the left image and the right one."""
+    """Return views whose board moved by 0.3 mm between the left and the right image."""
     rng, result = np.random.default_rng(0), list(views)
     for number in range(FREE):
         pose, step = free_pose(rng), np.random.default_rng(number).normal(size=3)

@@ -1,4 +1,4 @@
-"""Lenses and relative pose from files of ROS, Kalibr and OpenCV: read, calibrated with, refused."""
+"""Lenses and relative pose from files of ROS, Kalibr and OpenCV: reading, use and rejection."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Content = dict[str, Any]
 
 
 def pair(calibration: StereoCalibration) -> tuple[list[Any], list[Any], Any]:
-    """Matrices, lenses and T_right_left of a rig."""
+    """Return camera matrices, lenses and T_right_left of a rig."""
     left, right = calibration.left, calibration.right
     pose = right.T_optical_rig @ np.linalg.inv(left.T_optical_rig)
     return [left.camera_matrix, right.camera_matrix], [left.distortion, right.distortion], pose
 
 
 def ros(calibration: StereoCalibration) -> list[Content]:
-    """What camera_calibration writes of left and right."""
+    """Return the files that camera_calibration writes for left and right."""
     (m0, m1), (d0, d1), pose = pair(calibration)
     shift = pose[:3, 3].reshape(3, 1).copy()
     rectified = cv2.stereoRectify(
@@ -82,7 +82,7 @@ def storage(path: Path, content: Content) -> Path:
 
 
 def all_formats(folder: Path, calibration: StereoCalibration) -> dict[str, list[Path]]:
-    """Write the pair as each of the tools does; returns what follows --lenses."""
+    """Write the pair in the format of each tool; return the arguments of --lenses."""
     matrices, lenses, pose = pair(calibration)
     places, own = {"R": pose[:3, :3].copy(), "T": pose[:3, 3].copy()}, {}
     for end, (m, d) in {"yml": "MD", "xml": "KD", "json": ("cameraMatrix", "distCoeffs")}.items():
@@ -112,7 +112,7 @@ def test_each_format_is_read_back(tmp_path: Path, calibration: StereoCalibration
             np.testing.assert_allclose(camera.distortion, lenses[i], atol=1e-6)
         np.testing.assert_array_equal(found.left.T_optical_rig, np.eye(4))
         np.testing.assert_allclose(found.right.T_optical_rig, pose, atol=2e-6)
-        # Where the rig's own calibration is expected it is named.
+        # An error names the missing calibration of the rig.
         with pytest.raises(UserError, match=f"is {tool}.*`calibrate_stereo --lenses` takes it"):
             load_calibration(paths[-1])
 

@@ -1,4 +1,4 @@
-"""Calibration of rigs that are known, from corners with noise: what comes out, what is refused."""
+"""Calibration of known rigs from noisy corners: accuracy, uncertainty and rejections."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ RIGS = pytest.mark.parametrize(("rigs", "found"), [("rig", "result"), ("box_rig"
 
 
 def tip_error(rig: StereoRig, calibration: StereoCalibration) -> float:
-    """95 % of tips all over the phantom are off by less [m], seen without noise."""
+    """Return the 95th percentile of the errors of noise-free tips all over the phantom [m]."""
     points = needle_points(calibration)
     left, right = (seen(camera, points, True) for camera in (rig.left, rig.right))
     errors = np.linalg.norm(measured_points(calibration, left, right) - points, axis=-1)
@@ -60,7 +60,7 @@ def test_tips_are_accurate_to_60_micrometres_as_reported(
     assert error <= 1.5 * result.tip_error_p95 <= 120e-6
     assert result.fit.corner_sigma_px == pytest.approx(NOISE_PX, rel=0.1)
     for side in SIDES:
-        # Two coordinates.
+        # Two coordinates per corner.
         assert result.reprojection_rms_px(side) == pytest.approx(math.sqrt(2) * NOISE_PX, rel=0.15)
     error, sigma = square_error(result)
     assert abs(error) < 4.0 * sigma
@@ -92,7 +92,7 @@ def test_windows_are_estimated_as_far_as_the_views_determine_them(
             getattr(box_result.calibration, side).window,
             getattr(box_rig, side).window.normal,
         )
-        # Given level or plumb, 0.3 deg off.
+        # Given as level or plumb, which is wrong by 0.3 deg.
         assert np.linalg.norm(given.normal - normal) > 4e-3
         tilt = [float(box_result.parameters[f"{side}.window_tilt_{i}"].sigma) for i in (1, 2)]
         assert np.linalg.norm(window.normal - normal) < 3.5 * math.hypot(*tilt)
@@ -103,7 +103,7 @@ def test_windows_are_estimated_as_far_as_the_views_determine_them(
 def test_undetermined_parameters_keep_their_given_values(
     rig: StereoRig, calibration: StereoCalibration
 ) -> None:
-    # One flat board does not tell the index from the height.
+    # One flat board does not separate the index from the height.
     places = {name: PLACES[name] for name in ("surface_a", "surface_b", "under_deep")}
     views = take(rig, 2, places=places, noise=0.05)
     found = calibrate(views, SIZES, GIVEN, lenses_of(calibration)).parameters
@@ -146,7 +146,7 @@ def test_the_jacobian_agrees_with_finite_differences(
     else:
         views = views[6:9]
         model = RigModel(calibration, views, np.stack([v.place.T_rig_board for v in views]))  # type: ignore[union-attr]
-    # Boards turned and shifted from where they start.
+    # Turn and shift the boards away from their initial poses.
     at = model.start.copy()
     at[model.shared :] += np.tile([0.02, -0.03, 0.05, 1e-3, -2e-3, 1e-3], len(model.views))
     jacobian = model.jacobian(at, np.ones(len(at), dtype=bool))
@@ -176,7 +176,7 @@ def test_a_written_calibration_is_read_back(
 
 
 def without(views: list[BoardView], number: int, side: str, corners: int) -> list[BoardView]:
-    """Views in one of which a camera sees only so many corners."""
+    """Return the views with only some corners of one camera in one view."""
     whole = views[number].corners(side)
     few = Corners(whole.points[:corners], whole.pixels[:corners])
     spoilt = dataclasses.replace(views[number], **{side: few})  # type: ignore[arg-type]
@@ -199,7 +199,7 @@ def test_sets_that_cannot_determine_the_rig_are_rejected(
         (without(views, 0, "left", 11), GIVEN, "the left camera sees 11 corners.* 12 are needed"),
         ([v for v in views if v.place is None], GIVEN, "`rig` is undetermined"),
         ([*level, *views[6:]], GIVEN, "parallel"),
-        # Before its window, a board in air counts for the camera that sees it.
+        # A board in air in front of a window counts for the camera that sees it.
         ([v for v in box_views if v not in alone], GIVEN_BOX, "freely in air that the right"),
         ([v for v in box_views if v.place is not STANDS], GIVEN_BOX, "is undetermined"),
         (without(box_views, 13, "right", 0), GIVEN_BOX, "box_00: the right camera sees 0 corners"),

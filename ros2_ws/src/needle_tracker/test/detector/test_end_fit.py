@@ -1,4 +1,4 @@
-"""Line and end from maps whose truth is drawn: where, and how surely."""
+"""Line and end fitted to maps of known truth: position and uncertainty."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ END = np.array([97.3, 46.6])
 def maps(
     angle: float, sigma: float, *, known: float = 0.95, end: np.ndarray = END
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw a straight shaft, and the density of an end that is normal about it."""
+    """Draw a straight shaft, and a normal density of its end."""
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
     along = math.cos(angle) * (u - end[0]) + math.sin(angle) * (v - end[1])
     across = -math.sin(angle) * (u - end[0]) + math.cos(angle) * (v - end[1])
@@ -30,7 +30,7 @@ def maps(
 def fitted(
     drawn: tuple[np.ndarray, np.ndarray], angle: float, across: float = 4.0
 ) -> ImageEnd | None:
-    """Fit from a place 3 px and a direction 0.03 rad beside the truth."""
+    """Fit from a position 3 px and a direction 0.03 rad beside the truth."""
     direction = np.array([math.cos(angle + 0.03), math.sin(angle + 0.03)])
     place = END + np.array([3.0, 0.0])
     return fit_end(*drawn, place, direction, behind=60.0, along=15.0, across=across, width=WIDTH)
@@ -60,7 +60,7 @@ def test_an_end_that_the_map_does_not_show_may_be_anywhere_in_the_window() -> No
     shaft, ends = maps(0.1, 1.0)
     end = fitted((shaft, 1e-6 * ends), 0.1)
     assert end is not None
-    # Of a uniform density over 30 px the middle 68 % are 20 px.
+    # The middle 68 % of a uniform density over 30 px are 20 px.
     assert end.sigma_along == pytest.approx(10.0, abs=1.5)
     assert end.ends < 1e-3
     assert end.sigma_across < 0.6, "its line is seen as well as ever"

@@ -1,4 +1,4 @@
-"""Which pair shows the background."""
+"""Choice of the background pair."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def pair(level: int) -> Pair:
 
 
 def shown(background: Background, insertions: list[float | None]) -> list[int | None]:
-    """Return which of the pairs is the background of each."""
+    """Return the number of the background pair for each pair."""
     pairs = [background.update(pair(i), insertion) for i, insertion in enumerate(insertions)]
     return [None if each is None else int(each[0][0, 0]) for each in pairs]
 
@@ -24,11 +24,11 @@ def shown(background: Background, insertions: list[float | None]) -> list[int | 
     ("insertions", "expected"),
     [
         ([None, None, None], [None, 0, 0]),
-        # Less than 2 mm of new needle say too little.
+        # Less than 2 mm of new needle is not enough.
         ([0.050, 0.051, 0.053], [None, None, 0]),
         ([0.050, 0.030, 0.040], [None, None, 1]),
         ([0.0, 0.010, -0.001, 0.020], [None, 0, None, 2]),
-        # Outside, each new pair is as good and newer.
+        # Outside, a newer pair is preferred.
         ([0.0, -0.002, 0.0, 0.050], [None, None, None, 2]),
     ],
 )

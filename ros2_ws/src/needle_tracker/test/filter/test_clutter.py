@@ -1,4 +1,4 @@
-"""Runs through the renderer's scenarios, a sample of what `scripts/verify C` does at full size."""
+"""Runs through the renderer's scenarios, a sample of the full-size checks of `scripts/verify C`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def insertion(
 @pytest.mark.parametrize(
     ("scenario", "bound", "least"), [("clutter", 0.5e-3, 13), ("heavy_clutter", 1.5e-3, 8)]
 )
-def test_believed_tips_are_right(
+def test_reported_tips_are_right(
     tracker: NeedleTracker, calibration_path: Path, scenario: str, bound: float, least: int
 ) -> None:
     found = 0

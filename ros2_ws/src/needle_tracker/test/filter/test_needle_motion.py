@@ -32,7 +32,7 @@ def motion(settings: StereoTrackerParameters) -> NeedleMotion:
     return NeedleMotion.begin(sighting(np.array([0.001, 0.002, 0.05])), settings)
 
 
-def test_the_needle_advances_along_its_heading_by_the_way_of_the_stage(
+def test_the_needle_advances_along_its_heading_by_the_motion_of_the_stage(
     motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
     after = motion.advanced(2e-3, settings.max_curvature)
@@ -44,7 +44,7 @@ def test_the_needle_advances_along_its_heading_by_the_way_of_the_stage(
     assert np.linalg.eigvalsh(back.covariance)[0] > 0.0
 
 
-def test_the_covariance_after_a_way_agrees_with_simulated_needles(
+def test_the_covariance_after_a_motion_agrees_with_simulated_needles(
     motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
     rng, way = np.random.default_rng(0), 5e-3
@@ -59,7 +59,7 @@ def test_the_covariance_after_a_way_agrees_with_simulated_needles(
     )
 
 
-def test_an_unknown_way_spreads_the_tip_along_the_heading_and_beside_it(
+def test_an_unknown_motion_spreads_the_tip_along_the_heading_and_across_it(
     motion: NeedleMotion,
 ) -> None:
     rng, sigma = np.random.default_rng(3), 4e-3
@@ -85,7 +85,7 @@ def test_sequential_corrections_equal_one_batch(motion: NeedleMotion) -> None:
 def test_an_error_of_the_stage_is_estimated_and_does_not_move_the_tip(
     motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
-    """Zero 1 mm off, scale 1 %: 60 mm of insertion, a sighting and a length for each mm."""
+    """Zero wrong by 1 mm, scale by 1 %: 60 mm of insertion, a sighting and a length per mm."""
     rng, zero, scale = np.random.default_rng(2), 1e-3, 0.01
     at = motion.mean[POSITION]
     for mm in range(60):

@@ -42,11 +42,11 @@ def after(
 def test_an_end_at_the_insertion_is_the_needle_at_once(settings: StereoTrackerParameters) -> None:
     assert after(settings, [0.05], [0.05]).log_odds() > ACCEPTED
     assert after(settings, [0.05], [0.056]).log_odds() < 0.0
-    # A stage 1 mm off does not hide the needle.
+    # A stage error of 1 mm does not hide the needle.
     assert after(settings, [0.05], [0.051]).log_odds() > ACCEPTED
 
 
-def test_a_thing_at_rest_while_the_stage_moves_is_no_needle(
+def test_an_object_at_rest_while_the_stage_moves_is_no_needle(
     settings: StereoTrackerParameters,
 ) -> None:
     insertions = [0.049 + 5e-4 * n for n in range(8)]
@@ -55,7 +55,7 @@ def test_a_thing_at_rest_while_the_stage_moves_is_no_needle(
     assert moving.log_odds() > ACCEPTED
 
 
-def test_without_the_insertion_a_moving_thing_is_the_needle(
+def test_without_the_insertion_a_moving_object_is_the_needle(
     settings: StereoTrackerParameters,
 ) -> None:
     nothing: list[float | None] = [None] * 10

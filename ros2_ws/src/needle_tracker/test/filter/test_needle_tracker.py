@@ -71,7 +71,7 @@ def test_a_rendered_needle_is_measured_to_some_tenths_of_a_millimetre(
     ]
     errors = tip_errors(measured, [pose for _, pose, _, _ in exposures])
     if not insertion_known:
-        # It must move before it is believed.
+        # It must move before it is accepted.
         assert np.all(np.isnan(errors[0]))
         errors, measured, exposures = errors[2:], measured[2:], exposures[2:]
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.2e-3
@@ -79,11 +79,11 @@ def test_a_rendered_needle_is_measured_to_some_tenths_of_a_millimetre(
     for m, error, (_, pose, _, _) in zip(measured, errors, exposures, strict=True):
         assert m.tip is not None
         assert error @ np.linalg.solve(m.tip.covariance, error) < 20.0
-        # The visible end leans by the pre-bend, not more.
+        # The visible end leans by no more than the pre-bend.
         assert m.tip.direction @ pose[:3, 2] > math.cos(math.radians(8.0))
 
 
-def test_the_needle_is_seen_from_just_beyond_the_entry(
+def test_the_needle_is_detected_from_just_beyond_the_entry(
     tracker: NeedleTracker, calibration_path: Path
 ) -> None:
     exposures = steered(calibration_path, 0.0, 1.0, 2, 9)
@@ -98,16 +98,16 @@ def test_the_needle_is_seen_from_just_beyond_the_entry(
         assert error @ np.linalg.solve(m.tip.covariance, error) < 20.0
 
 
-def test_an_unseen_short_needle_follows_from_the_insertion(
+def test_an_undetected_short_needle_is_placed_by_the_insertion(
     tracker: NeedleTracker, draw_pair: Drawer
 ) -> None:
-    """A loop must go on: whether the needle is seen shows a few mm later."""
+    """A control loop must continue: only some mm deeper the needle can be detected or missed."""
     for insertion in (0.001, 0.005, 0.0079):
         measured = tracker.process(*draw_pair(None, noise=5.0), insertion)
         assert (measured.state, measured.reason) == (TrackState.ENTRY, "")
         assert measured.tip is not None
         assert measured.tip.position.tolist() == [0.0, 0.0, insertion]
-        # As far aside as the entry angle says.
+        # The lateral sigma follows from the entry angle.
         assert measured.tip.covariance[0, 0] > (insertion * math.sin(math.radians(10.0))) ** 2
     assert tracker.process(*draw_pair(None, noise=5.0), 0.0081).tip is None
 
@@ -128,7 +128,7 @@ def test_same_images_give_the_same_bits(
 def test_no_function_is_compiled_after_the_warm_up(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: Callable[..., np.ndarray]
 ) -> None:
-    """A first needle of another length must not make a pair wait for seconds."""
+    """The length of the first needle must not cause a compilation, which takes seconds."""
 
     def compiled_for() -> dict[str, int]:
         return {
@@ -154,7 +154,7 @@ def test_no_function_is_compiled_after_the_warm_up(
 
 
 def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Drawer) -> None:
-    """Sheath, hole, uneven light and noise are there; the needle is not."""
+    """Sheath, hole, uneven light and noise are drawn, but no needle."""
     for seed, insertion in enumerate((0.009, 0.02, 0.08, 0.12, None, None, None, None)):
         measured = tracker.process(*draw_pair(None, seed=seed, noise=5.0), insertion)
         assert measured.tip is None
@@ -162,7 +162,7 @@ def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Draw
         assert measured.state is TrackState.SEARCHING
 
 
-def test_one_blocked_camera_loses_the_track_until_it_sees_again(
+def test_a_blocked_camera_loses_the_track_until_it_is_clear(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
     left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
@@ -177,7 +177,7 @@ def test_one_blocked_camera_loses_the_track_until_it_sees_again(
     assert again.tip is not None
 
 
-def test_without_an_encoder_a_needle_that_went_on_unseen_is_found_again(
+def test_without_an_encoder_a_needle_that_advanced_undetected_is_found_again(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
     for mm in range(48, 52):
@@ -191,7 +191,7 @@ def test_without_an_encoder_a_needle_that_went_on_unseen_is_found_again(
     assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
 
 
-def test_without_an_encoder_a_needle_is_found_beside_an_old_track_that_stands(
+def test_without_an_encoder_a_needle_is_found_beside_an_old_static_track(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
     old, reasons = make_arc(0.045, 5.0, 0.5), []

@@ -22,7 +22,7 @@ _CHI_SQUARED_999 = 16.27  # of three degrees of freedom
 
 
 def cut(camera: Camera, crop: list[int]) -> Camera:
-    """Return the camera that sees only a part of the image."""
+    """Return a camera cropped to a part of the image."""
     column, row, width, height = crop
     matrix = camera.camera_matrix.copy()
     matrix[:2, 2] -= column, row
@@ -45,7 +45,7 @@ def tracked(
     empty: bool,
     insertion: bool = True,
 ) -> list[tuple[SpatialTip | None, np.ndarray]]:
-    """Return what is said of each pair of a scene, and the truth; a box has its own cameras."""
+    """Return the result for each pair of a scene, and the truth; a box has its own cameras."""
     folder = SCENES / name
     scene: dict[str, Any] = yaml.safe_load((folder / "scene.yaml").read_text(encoding="utf-8"))
     if (folder / "calibration.yaml").is_file():
@@ -86,7 +86,7 @@ def test_a_line_of_paper_along_the_needle_does_not_bias_the_tip(
         assert tip is None or np.linalg.norm(tip.position - truth) < 1e-3
 
 
-def test_without_the_insertion_nothing_over_graph_paper_is_believed_at_once_or_wrongly(
+def test_without_the_insertion_no_tip_over_graph_paper_is_immediate_or_wrong(
     calibration: StereoCalibration,
 ) -> None:
     looks = tracked(calibration, "steel_on_graph_paper", empty=True, insertion=False)

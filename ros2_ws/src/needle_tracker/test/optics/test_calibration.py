@@ -1,4 +1,4 @@
-"""A calibration file is read as it says, and a bad one is one line that says where."""
+"""Calibration files: content, and one-line errors that name the place."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def test_a_common_surface_is_the_window_of_both_cameras(content: Any) -> None:
         assert camera.window.point.tolist() == [0.0175, 0.0, 0.0]
         assert camera.window.normal.tolist() == [1.0, 0.0, 0.0]
         assert (camera.window.layers, camera.window.inside) == ((), 1.3)
-        # Both look down from above it.
+        # Both cameras look down from above the surface.
         assert camera.window.height(camera.centre) > 0.0
         assert camera.T_optical_rig[2, 0] < -0.9
     assert calibration.surface is calibration.left.window
-    # Said of each camera, it is the same surface.
+    # Given for each camera separately, it is the same surface.
     del content["phantom"]
     window = {"point": [0.0175, 0.1, 0.2], "normal": [1, 0, 0], "layers": [], "inside": 1.3}
     for side in SIDES:
@@ -68,13 +68,13 @@ def test_windows_are_read(own_windows: Any) -> None:
     assert window.normal[1] == pytest.approx(0.99998, abs=1e-5)
     assert [(layer.thickness, layer.refractive_index) for layer in window.layers] == [(0.005, 1.49)]
     assert window.inside == 1.34
-    # 500 mm before the outer faces.
+    # 500 mm in front of the outer faces.
     for camera in (calibration.left, calibration.right):
         assert float(camera.window.height(camera.centre)) == pytest.approx(0.5, abs=1e-3)
 
 
 def put(*keys: Any) -> Callable[[Any], None]:
-    """Return what sets the value at the last key but one to the last."""
+    """Return a function that sets the value at all keys but the last to the last."""
 
     def change(content: Any) -> None:
         for key in keys[:-2]:

@@ -1,4 +1,4 @@
-"""Refraction at windows of any place, direction and number of layers, against its laws.
+"""Refraction at windows of any position, direction and number of layers, against its laws.
 
 Oracles: the package aquacal, Fermat's principle, Snell's law, OpenCV's projection.
 """
@@ -40,7 +40,7 @@ Array = np.ndarray
 
 
 def random_view(seed: int, layers: int, turn: Array | None = None) -> tuple[RefractedCamera, Array]:
-    """A camera up to 40 deg oblique to a window of some layers, and points in its body."""
+    """Return a camera up to 40 deg oblique to a window of some layers, and points behind it."""
     rng = np.random.default_rng(seed)
     turn = Rotation.random(rng=rng).as_matrix() if turn is None else turn
     walls = tuple(Layer(*rng.uniform([1e-3, 1.0], [0.02, 1.8]).tolist()) for _ in range(layers))
@@ -65,7 +65,7 @@ VIEWS = pytest.mark.parametrize(("view", "points"), [random_view(n, n) for n in 
 
 
 def straight(camera: Camera, points: Array) -> Array:
-    """Pixels without any window, by OpenCV."""
+    """Return the pixels without any window, by OpenCV."""
     pose = camera.T_optical_rig
     turn, _ = cv2.Rodrigues(pose[:3, :3])
     pixels, _ = cv2.projectPoints(
@@ -91,7 +91,7 @@ def compiled_rays(view: RefractedCamera, pixels: Array) -> tuple[Array, Array]:
 
 @pytest.fixture(scope="module")
 def aquacal() -> Any:
-    """aquacal's geometry alone: `import aquacal` would want all that its calibration needs."""
+    """Geometry of aquacal alone: `import aquacal` would need all that its calibration needs."""
     spec = importlib.util.find_spec("aquacal")
     assert spec is not None, "aquacal is not installed: scripts/setup"
     assert spec.submodule_search_locations is not None
@@ -106,11 +106,11 @@ def aquacal() -> Any:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_pixels_and_rays_agree_with_aquacal(aquacal: Any, seed: int) -> None:
-    # Its world has z down into the water: x = rig y, y = -rig z, z = -rig x.
+    # The world of aquacal has z down into the water: x = rig y, y = -rig z, z = -rig x.
     turn = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
     view, points = random_view(seed, 0, np.eye(3))
     schema = importlib.import_module("aquacal.config.schema")
-    # Its lenses are undistorted by OpenCV's few iterations, hence a perfect lens for rays.
+    # aquacal undistorts by few iterations of OpenCV, so rays are compared with a perfect lens.
     for distortion in (view.camera.distortion, np.zeros(5)):
         camera = dataclasses.replace(view.camera, distortion=distortion)
         view, pose = RefractedCamera(camera), camera.T_optical_rig
@@ -139,7 +139,7 @@ def test_pixels_and_rays_agree_with_aquacal(aquacal: Any, seed: int) -> None:
 def test_light_takes_the_fastest_path_through_all_layers(
     view: RefractedCamera, points: Array
 ) -> None:
-    """Fermat: the travel time is stationary over where each face is crossed."""
+    """Fermat: the travel time is stationary with respect to the crossing of each face."""
     window = view.camera.window
     along = np.linalg.svd(window.normal[None])[2][1:]
     depths = np.cumsum([0.0, *(layer.thickness for layer in window.layers)])
@@ -177,7 +177,7 @@ def test_a_ray_leads_back_to_the_point_by_snells_law(view: RefractedCamera, poin
         away = points - origins
         across = away - np.sum(away * directions, axis=1)[:, None] * directions
         np.testing.assert_allclose(across, 0.0, atol=1e-12)
-    # What lies between the faces changes the place, not the direction.
+    # The layers between the faces displace the ray, but do not turn it.
     matrix = np.linalg.inv(camera.camera_matrix)
     air = np.column_stack([pixels, np.ones(len(pixels))]) @ matrix.T
     air = air / np.linalg.norm(air, axis=1)[:, None] @ camera.T_optical_rig[:3, :3]
@@ -190,7 +190,7 @@ def test_a_ray_leads_back_to_the_point_by_snells_law(view: RefractedCamera, poin
 def test_the_compiled_projection_agrees_with_the_array_projection(
     view: RefractedCamera, points: Array
 ) -> None:
-    # Deep, in the layers, and before the window.
+    # Deep, in the layers, and in front of the window.
     window, depths = view.camera.window, np.linspace(-0.03, 0.05, len(points))
     everywhere = points + (window.depth(points) - depths)[:, None] * window.normal
     pixels = view.project(everywhere)
@@ -200,11 +200,11 @@ def test_the_compiled_projection_agrees_with_the_array_projection(
 def test_missing_rays_and_pixels_are_nan() -> None:
     view, _ = random_view(0, 0)
     camera = view.camera
-    # Strong barrel distortion: no ideal point is seen that far out.
+    # Strong barrel distortion: no ideal point is imaged that far out.
     barrel = np.array([-0.5, 0.0, 0.0, 0.0, 0.0])
     far = camera.camera_matrix[:2, 2] + 3.0 * camera.camera_matrix[[0, 1], [0, 1]]
     bent = RefractedCamera(dataclasses.replace(camera, distortion=barrel))
-    # A camera turned round looks away from the window.
+    # A reversed camera looks away from the window.
     pose = camera.T_optical_rig.copy()
     pose[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ pose[:3, :3]
     pose[:3, 3] = -pose[:3, :3] @ camera.centre
@@ -236,7 +236,7 @@ def test_each_view_of_a_box_searches_the_reach_of_the_needle(calibration_path: P
         grid = make_search_grid(view, StereoTrackerParameters())
         assert grid.reachable[:, len(grid.angles) // 2].mean() > 0.9
         assert abs(view.sideways[1 - number]) > 0.999
-        # A needle that bends towards this camera lies on the grid's middle, one aside does not.
+        # A needle that bends towards this camera is in the middle of the grid, one aside is not.
         for bend, angle in ((np.eye(3)[number], 0.0), (view.sideways, 0.1)):
             tip = np.array([0.0, 0.0, 0.1]) + 0.01 * bend
             off = np.linalg.norm(grid.pixels[grid.row_of(0.1)] - view.project(tip), axis=-1)

@@ -1,4 +1,4 @@
-"""Brightness from each encoding, against the rule of Rec. 601 and patterns laid out by hand."""
+"""Brightness from each encoding, against Rec. 601 and hand-made patterns."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, grey_image
 
-# The pattern's first row, then its second: red, green and blue.
+# First row of the pattern, then its second: red, green and blue.
 BAYER = {"rggb": "0112", "bggr": "2110", "gbrg": "1201", "grbg": "1021"}
 
 
@@ -16,7 +16,7 @@ def brightness(colour: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def encoded(encoding: str, colour: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the rows of bytes that a camera sends of a scene."""
+    """Return the rows of bytes that a camera sends for a scene."""
     height, width, _ = colour.shape
     grey = np.rint(brightness(colour)).astype(np.uint8)
     if encoding.startswith("bayer_"):
@@ -48,7 +48,7 @@ def test_brightness_is_that_of_the_scene() -> None:
         grey = grey_image(np.pad(rows, ((0, 0), (0, 5)), constant_values=255), 80, encoding)
         assert grey.shape == (60, 80)
         off = np.abs(grey.astype(float) - brightness(colour))[2:-2, 2:-2]
-        # Neighbours fill in what a pattern leaves out.
+        # Colours missing in the pattern are interpolated from the neighbours.
         assert off.max() <= (3.0 if encoding.startswith("bayer_") else 1.0), encoding
     grey_rows = encoded("mono8", colour)
     assert np.shares_memory(grey_image(grey_rows, 60, "mono8"), grey_rows)

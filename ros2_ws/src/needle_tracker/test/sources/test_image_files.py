@@ -1,4 +1,4 @@
-"""Images of two cameras by the names that other tools give them."""
+"""Images of two cameras, with the file names of other tools."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from needle_core.errors import UserError
 from needle_tracker.sources.image_files import open_pairs
 
-# Left, right and the first pair's name, in one folder or in two.
+# Left, right and the name of the first pair, in one folder or two.
 NAMES = [
     ("left-%04d.png", "right-%04d.png", "0000.png"),
     ("left%02d.png", "right%02d.png", "00.png"),
@@ -24,7 +24,7 @@ NAMES = [
 
 
 def save(folder: Path, names: list[str], grey: int) -> Path:
-    """Save images that are a little brighter one after the other."""
+    """Save images of increasing brightness."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, name in enumerate(names):
         cv2.imwrite(str(folder / name), np.full((4, 4), grey + number, np.uint8))
@@ -32,7 +32,7 @@ def save(folder: Path, names: list[str], grey: int) -> Path:
 
 
 def assert_paired(left: Path, right: Path, count: int, first: str) -> None:
-    """Each name has the left and the right image of one moment."""
+    """Check that each name has the left and the right image of one moment."""
     pairs = open_pairs(left, right)
     assert pairs.unpaired == []
     assert pairs.names[0] == first
@@ -43,15 +43,17 @@ def assert_paired(left: Path, right: Path, count: int, first: str) -> None:
 def test_names_that_differ_in_the_side_are_pairs(tmp_path: Path) -> None:
     for number, (left, right, first) in enumerate(NAMES):
         for folders in (("left", "right"), ("both", "both")):
-            # 11 images: 10 comes after 9, not after 1.
+            # Of 11 images, 10 comes after 9, not after 1.
             a, b = (tmp_path / str(number) / folder for folder in folders)
             save(a, [left % image for image in range(11)], 10)
             save(b, [right % image for image in range(11)], 200)
             assert_paired(a, b, 11, first)
 
 
-def test_equal_names_stay_pairs_though_they_hold_a_side_and_lie_in_data(tmp_path: Path) -> None:
-    # As Kalibr and EuRoC have their folders.
+def test_equal_names_are_pairs_even_if_they_contain_a_side_in_folders_named_data(
+    tmp_path: Path,
+) -> None:
+    # Folders as in Kalibr and EuRoC.
     names = ["left_wall_1.png", "left_wall_2.png", "right_wall_1.png", "right_wall_2.png"]
     left, right = tmp_path / "cam0", tmp_path / "cam1"
     save(left / "data", names, 10)

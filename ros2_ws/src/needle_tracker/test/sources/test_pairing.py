@@ -31,7 +31,7 @@ def test_latest_is_never_paired_with_latest_and_dropped_images_are_counted() -> 
     assert matcher.add("right", 21, "r21") is not None
     assert matcher.unpaired == {"left": 1, "right": 1}
     assert matcher.add("right", 10, "r10") is None
-    # One camera alone does not pile up.
+    # Images of one camera alone do not accumulate.
     for stamp in range(100, 200):
         assert matcher.add("right", stamp, "r") is None
     assert len(matcher.waiting("right")) == 3
@@ -63,7 +63,7 @@ def test_free_running_cameras_pair_within_half_a_frame_and_the_skew_is_reported(
     median, largest = matcher.skew or (0.0, 0)
     assert (median, largest) == (late + 1_000.0, late + 2_000)
     assert matcher.tolerance == period // 2
-    # A frame without a partner in its own half is no pair's.
+    # A frame without a partner within half a period has no pair.
     assert matcher.add("left", 40 * period, "l40") is None
     assert matcher.add("right", 40 * period + 20_000, "r40") is None
 
@@ -78,7 +78,7 @@ def test_insertion_is_interpolated_at_the_exposure() -> None:
     assert history.is_bracketed(150)
     for stamp, insertion in ((99, None), (100, 0.010), (130, 0.013), (200, 0.020)):
         assert history.at(stamp) == (insertion and pytest.approx(insertion))
-    # Of two at one moment the later counts; one that is not finite does not.
+    # The later of two equal stamps counts; a non-finite value does not.
     history.add(200, 0.030)
     history.add(210, math.nan)
     assert (history.at(200), history.rejected, history.is_bracketed(205)) == (0.030, 1, False)

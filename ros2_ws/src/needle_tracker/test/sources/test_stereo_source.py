@@ -23,7 +23,7 @@ SIZES = {"left": (64, 48), "right": (64, 48)}
 
 
 class Clock:
-    """Every look at it is 1 ms later."""
+    """Clock that advances by 1 ms with every reading."""
 
     def __init__(self) -> None:
         self.now = 0
@@ -34,7 +34,7 @@ class Clock:
 
 
 class FakeCapture:
-    """A camera of which each grab and retrieve is noted."""
+    """Camera that records each grab and retrieve."""
 
     def __init__(self, name: str, log: list[str], width: int) -> None:
         self.name, self.log, self.width = name, log, width
@@ -77,7 +77,7 @@ def write_pairs(folder: Path, count: int, size: tuple[int, int] = (64, 48)) -> t
 
 
 def levels_of(source: CameraPair | RecordedPairs, most: int = 99) -> tuple[list[int], str]:
-    """Return a grey level of each left image, 0 for what cannot be read, and what was lacking."""
+    """Return the grey level of each left image, 0 if unreadable, and the reason of the end."""
     levels: list[int] = []
     while len(levels) < most and not isinstance(event := source.next(), EndOfRecording):
         levels.append(int(event.left[24, 32]) if event else -1)
@@ -122,9 +122,9 @@ def test_folders_are_read_in_order_and_end_or_restart(tmp_path: Path) -> None:
     assert levels_of(source, 4) == ([0, 10, 20, 0], "no end")
     again = source.next()
     assert isinstance(again, StampedPair)
-    # The clock is asked for each pair, and for the one that is looked at when the source opens.
+    # The clock is read for each pair, and for the pair read when the source opens.
     assert again.left_stamp == 6_000_000
-    # What cannot be read, and is not of 8 bit, is dropped with its partner.
+    # An image that is unreadable or not of 8 bit is dropped with its partner.
     (right / "001.png").write_bytes(b"no image")
     cv2.imwrite(str(left / "002.png"), np.full((48, 64), 3000, np.uint16))
     assert levels_of(opened(left, right))[0] == [0, -1, -1]

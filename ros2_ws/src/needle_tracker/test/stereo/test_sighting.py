@@ -28,7 +28,7 @@ MakeArc = Callable[..., np.ndarray]
 
 @dataclasses.dataclass
 class SeenLines:
-    """In place of a detector: the lines that a camera sees, each from the entry to its end."""
+    """Stand-in for a detector: the lines in a camera's view, each from the entry to its end."""
 
     view: RefractedCamera
     lines: list[np.ndarray]
@@ -147,7 +147,7 @@ def distance_to(points: np.ndarray, curve: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("curvature", [2.0, 7.0])
 def test_shaft_points_are_on_the_shaft(views: Views, curvature: float, roll: float) -> None:
     points = arc(curvature, roll)
-    # The right path starts elsewhere and has other points.
+    # The right path starts elsewhere and has different points.
     paths = (seen(views[0], points), seen(views[1], arc(curvature, roll, start=5e-3, count=171)))
     found = shaft_points(views, paths, points[-1])
     assert len(found) >= 9
@@ -166,7 +166,7 @@ def test_the_steps_of_the_cells_are_smoothed(views: Views, roll: float) -> None:
         for p in (seen(view, points) for view in views)
     )
     found = shaft_points(views, (paths[0], paths[1]), points[-1])
-    # 1.5 px are 0.2 mm; seven cells together leave less of that, the cameras' depth makes it more.
+    # 1.5 px are 0.2 mm; averaging seven cells reduces that, the depth direction increases it.
     assert distance_to(found, arc(4.0, roll, count=20_001)).max() < 1e-3
 
 
@@ -192,7 +192,7 @@ def test_a_shadow_on_the_floor_is_not_reachable(
 def test_a_line_along_the_baseline_has_no_shaft_points(views: Views) -> None:
     y = np.linspace(-20e-3, 20e-3, 130)
     line = np.stack([0.0 * y, y, np.full_like(y, 62.5e-3)], axis=1)
-    # Every ray of one image meets all of the other's there, and a hair's breadth says where.
+    # There, the rays of both images are coplanar, and their intersection is undetermined.
     found = shaft_points(views, (seen(views[0], line), seen(views[1], line)), line[-1])
     np.testing.assert_array_equal(found, line[-1:])
 

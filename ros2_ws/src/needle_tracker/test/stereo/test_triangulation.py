@@ -1,4 +1,4 @@
-"""From two image tips to the tip in space: exact without noise, honest with it."""
+"""Tip in space from two image tips: exact without noise, consistent with noise."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def moved(tip: ImageEnd, along: float, across: float, turn: float) -> ImageEnd:
 
 
 def measured(tip: ImageEnd, rng: np.random.Generator) -> ImageEnd:
-    """Return an end with the errors that it claims."""
+    """Return an end with random errors as it claims."""
     return moved(tip, rng.normal(0, 0.5), rng.normal(0, 0.05), rng.normal(0, 2e-3))
 
 
@@ -82,7 +82,7 @@ def test_covariances_fit_the_errors(views: Views) -> None:
         np.sqrt(np.diag(tip.direction_covariance)), np.sqrt(np.diag(spread)), rtol=0.2, atol=1e-4
     )
     assert abs(tip.direction @ tip.direction_covariance @ tip.direction) < 1e-12
-    # Loose along the needle: the badly seen end does not spoil the depth.
+    # The poorly measured position along the needle does not spoil the depth.
     assert np.std(np.array(errors)[:, 0]) < 0.6 * np.std(np.array(plain)[:, 0])
 
 
@@ -130,7 +130,7 @@ def test_a_needle_along_the_baseline_has_no_direction(views: Views) -> None:
     tips = seen(views, np.array([0.0, 0.0, 0.0625]), across)
     tip = triangulate(views, (tips[0], tips[1]))
     assert tip is None or tip.direction_covariance.trace() > 1e-3
-    # However well the lines are known: what calibration leaves would say where it points.
+    # However certain the lines are, residual calibration errors would determine the direction.
     tips = seen(views, np.array([0.0, 0.0, 0.0625]), across + np.array([0.0, 0.0, 1e-3]))
     left, right = (dataclasses.replace(tip, sigma_angle=1e-9) for tip in tips)
     assert triangulate(views, (left, right)) is None

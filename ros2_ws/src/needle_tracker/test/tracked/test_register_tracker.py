@@ -1,4 +1,4 @@
-"""Registrations of drawn points: errors as claimed, and each mistake by its name."""
+"""Registrations of simulated points: errors as claimed, and a named reason for each mistake."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def measured(rig: np.ndarray, seed: int = 1, noise: float = FLE) -> Any:
 
 
 def test_the_claimed_error_is_that_of_many_registrations() -> None:
-    """Against the truth at places inside and outside; the left-out error is a target error."""
+    """Errors inside and outside the points; the leave-one-out error is a target error."""
     places = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.12], [0.0, 0.1, 0.3]])
     squares, inside, left_out = [], [], []
     for seed in range(30):
@@ -45,10 +45,10 @@ def test_the_claimed_error_is_that_of_many_registrations() -> None:
             inside.append(error @ np.linalg.solve(covariance, error) < 14.16)
         left_out.append(np.mean(errors**2))
     true, claimed = np.mean(squares, axis=0)
-    # By Student's t, with 12 degrees of freedom, the claim is 12 / 10 of the mean.
+    # By Student's t with 12 degrees of freedom, the claim is 12 / 10 of the mean.
     assert claimed / true == pytest.approx(1.2, rel=0.2)
     assert np.mean(inside) > 0.98
-    # At a point left out the point's own error adds.
+    # The error of a left-out point itself is added.
     assert math.sqrt(np.mean(left_out)) > math.sqrt(3.0) * FLE
 
 

@@ -1,4 +1,4 @@
-"""What the component takes for a tip, and the link to PLUS byte by byte."""
+"""Tips accepted by the component, and the link to PLUS byte by byte."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_latency_moves_the_stamp_back_and_widens_the_covariance_along_the_needle
     assert at_rest.stamp_ns == pytest.approx((NOW + 0.2) * 1e9, abs=1e3)
     wider = np.diag(np.reshape(moving.covariance, (6, 6)) - np.reshape(at_rest.covariance, (6, 6)))
     assert wider[2] == pytest.approx((0.05 * 4e-3) ** 2, rel=0.1)
-    # Across it, the registration's rotation counts at another depth.
+    # Across the needle, the rotation of the registration counts at another depth.
     assert abs(wider[0]) < 0.2 * wider[2]
 
 
@@ -173,7 +173,7 @@ def test_checksum_is_that_of_the_standard() -> None:
 
 @pytest.mark.parametrize("garbage", [1, 58, 59, 66])
 def test_a_stream_in_pieces_among_other_messages(garbage: int) -> None:
-    """Garbage and a large image before a transform do not lose it; each is named once."""
+    """Garbage and a large image before a transform do not lose it; each is reported once."""
     pose = sensor(0.02, Rotation.identity(), 1)
     wanted = [transform_message(pose, NOW + k, status="OK" if k % 2 else "") for k in range(4)]
     status = message("STATUS", "Plus", NOW, bytes(30))

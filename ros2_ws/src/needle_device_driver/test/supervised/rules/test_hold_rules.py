@@ -19,7 +19,7 @@ def send_holds(bench: Bench, words: str) -> str:
     Returns
     -------
     str
-        Whose press counts after each; - for nobody's.
+        Owner of the hold after each message; - for none.
     """
     owners = []
     for sender, session, count, sign in re.findall(r"(\w*)/?(\w*)#?(\d*)([+-])", words):
@@ -272,7 +272,7 @@ def test_hold_in_order_remembers_sixteen_sessions_per_source() -> None:
     assert send_holds(bench, "a/t16#1- a/s#1- a/s#2+ b/s#1- b/t#1- a/s#3+") == "- - a a a a"
 
 
-# ---- what a reset lets in again -----------------------------------------------------------------
+# ---- what a reset accepts again -----------------------------------------------------------------
 
 
 def test_hold_in_order_reset_accepts_lower_stamps_without_session() -> None:

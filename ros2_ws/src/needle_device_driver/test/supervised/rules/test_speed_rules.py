@@ -167,7 +167,7 @@ def test_axis_speed_tolerates_one_fast_cycle() -> None:
     assert not answers.answer(0.51 * PERIOD, to=0.0)
 
 
-# ---- way of a homing ----------------------------------------------------------------------------
+# ---- distance of a homing -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
