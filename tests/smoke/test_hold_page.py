@@ -13,7 +13,7 @@ from needle_console.hold.page_session import PageHold
 
 pytest.importorskip("websockets", reason="the console's lock is not installed: scripts/console")
 
-from campaign.trials.console.button_page import BUTTON, serving_button
+from campaign.trials.console.button_page import BUTTON, serve_button_page
 
 pytestmark = [
     pytest.mark.skipif(chromium() is None, reason="no chromium: apt-get install chromium"),
@@ -102,7 +102,7 @@ class Scene:
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     folder: Path = tmp_path_factory.mktemp("browser")
     states: list[PageHold] = []
-    with serving_button(states.append, lambda _: None) as (page_port, hold):
+    with serve_button_page(states.append, lambda _: None) as (page_port, hold):
         browser = Chromium(folder / "profile")
         try:
             url = f"http://127.0.0.1:{page_port}/?port={hold.port}"

@@ -138,7 +138,7 @@ def _start_controller(scene: ObstacleScene, settings: SteeringSettings) -> Drive
     obstacles = tuple(float(value) for value in scene.obstacles.ravel())
     control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
     control.target_point = scene.target
-    if control.reason_without_path(0.0):
+    if control.path_problem(0.0):
         return None
 
     def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand | None:

@@ -58,7 +58,7 @@ class Access:
             for host in known
         )
 
-    def why_not_host(self, header: str | None) -> str:
+    def host_refusal(self, header: str | None) -> str:
         """Return the reason to refuse a Host header; empty if it is accepted."""
         try:
             split = urlsplit(f"//{header or ''}")
@@ -68,7 +68,7 @@ class Access:
         known = split.hostname in self._hosts and split.username is None
         return "" if known else "foreign Host"
 
-    def why_not_origin(self, header: str | None) -> str:
+    def origin_refusal(self, header: str | None) -> str:
         """Return the reason to refuse an Origin, which pages always send; empty if accepted."""
         return "" if (header or "").lower() in self._origins else "foreign Origin"
 
@@ -128,11 +128,11 @@ class Gate:
             await self.app(scope, receive, send)
 
     def _why_not(self, scope: _Scope) -> str:
-        why = self._access.why_not_host(_header(scope, b"host"))
+        why = self._access.host_refusal(_header(scope, b"host"))
         origin = _header(scope, b"origin")
         changes = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD")
         if not why and (origin or changes):
-            why = self._access.why_not_origin(origin)
+            why = self._access.origin_refusal(origin)
         return why
 
 

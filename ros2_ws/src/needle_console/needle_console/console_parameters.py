@@ -41,7 +41,7 @@ class ConsoleParameters:
         if self.port == self.hold_port:
             raise UserError(f"port and hold_port are both {self.port}, expected two")
 
-    def why_no_hold(self, simulated: bool | None, *, is_local: bool) -> str:
+    def hold_refusal(self, simulated: bool | None, *, is_local: bool) -> str:
         """Return the reason why a page may only watch and stop; empty if it may hold.
 
         Parameters

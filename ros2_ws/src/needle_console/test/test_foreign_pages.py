@@ -20,27 +20,27 @@ HOST, ORIGIN = ("host", "127.0.0.1:8080"), ("origin", "http://127.0.0.1:8080")
 
 def test_loopback_accepts_only_its_own_names() -> None:
     for host in ("localhost", "127.0.0.1", "127.0.0.1:8081", "LOCALHOST:8081", "[::1]:8081"):
-        assert LOOPBACK.why_not_host(host) == ""
+        assert LOOPBACK.host_refusal(host) == ""
     for foreign in (
         *(None, "", "evil.example", "localhost.evil.example", "localhost.", "192.168.1.5"),
         *("127.0.0.1.evil.example", "user@localhost", "localhost:port", "[::1"),
     ):
-        assert LOOPBACK.why_not_host(foreign) == "foreign Host"
+        assert LOOPBACK.host_refusal(foreign) == "foreign Host"
 
 
 def test_only_origins_with_the_page_port_are_accepted() -> None:
     for origin in ("http://localhost:8080", "http://127.0.0.1:8080", "https://[::1]:8080"):
-        assert LOOPBACK.why_not_origin(origin) == ""
+        assert LOOPBACK.origin_refusal(origin) == ""
     for foreign in (
         *(None, "", "null", "http://localhost", "http://localhost:8081", "localhost:8080"),
         *("http://evil.example:8080", "http://localhost:8080/path", "http://localhost:8080?query"),
         *("http://user@localhost:8080", "file://localhost:8080", "http://localhost:99999"),
     ):
-        assert LOOPBACK.why_not_origin(foreign) == "foreign Origin"
+        assert LOOPBACK.origin_refusal(foreign) == "foreign Origin"
     # A default port is left out.
     access = Access("192.168.1.5", 80, ["rig.lab"])
-    assert access.why_not_origin("http://rig.lab") == ""
-    assert access.why_not_origin("https://rig.lab") == "foreign Origin"
+    assert access.origin_refusal("http://rig.lab") == ""
+    assert access.origin_refusal("https://rig.lab") == "foreign Origin"
 
 
 def test_other_machines_need_a_host_name() -> None:
@@ -50,8 +50,8 @@ def test_other_machines_need_a_host_name() -> None:
         Access("rig.lab", 8080)
     # The address counts as a host name; loopback names would be another machine.
     access = ConsoleParameters(address="192.168.1.5").access()
-    assert access.why_not_host("192.168.1.5:8081") == ""
-    assert access.why_not_host("localhost:8081") == "foreign Host"
+    assert access.host_refusal("192.168.1.5:8081") == ""
+    assert access.host_refusal("localhost:8081") == "foreign Host"
 
 
 def asked(*headers: tuple[str, str], kind: str = "http", method: str = "GET") -> dict[str, Any]:
@@ -97,10 +97,10 @@ def test_page_cannot_be_framed() -> None:
 def test_real_rig_is_held_only_locally_and_if_allowed(hold_real_rig: bool, is_local: bool) -> None:
     port = PagePort(ConsoleParameters(hold_real_rig=hold_real_rig))
     # An unknown device may be a real one.
-    assert (port.why_no_hold(is_local) == "") == (hold_real_rig and is_local)
+    assert (port.hold_refusal(is_local) == "") == (hold_real_rig and is_local)
     for simulated in (True, False, None):
         port.send((Snapshot(device=DeviceStatus(simulated=simulated)),))
-        may_hold = not port.why_no_hold(is_local)
+        may_hold = not port.hold_refusal(is_local)
         assert may_hold == (simulated is True or (hold_real_rig and is_local))
 
 

@@ -65,7 +65,7 @@ class StereoTipTracker(Component):
     ----------
     answers : PairAnswers
         Core of the node.
-    is_annotation_wanted : bool
+    has_annotation_subscriber : bool
         Whether the annotated images have a subscriber.
     """
 
@@ -79,7 +79,7 @@ class StereoTipTracker(Component):
         name: str = name,
     ) -> None:
         self.name, self.settings = name, settings
-        self.is_annotation_wanted = False
+        self.has_annotation_subscriber = False
         self._cameras = calibration.cameras
         self._calibration_text = calibration_text
         self._is_calibration_published = False
@@ -102,7 +102,7 @@ class StereoTipTracker(Component):
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Record whether the annotated images have a subscriber."""
-        self.is_annotation_wanted = ANNOTATED in peers.subscribers
+        self.has_annotation_subscriber = ANNOTATED in peers.subscribers
         return ()
 
     def check(self, at: Moment) -> Actions:
@@ -161,7 +161,7 @@ class StereoTipTracker(Component):
     def _annotate(self, answer: Answer, at: Moment) -> Actions:
         left, right = answer.pair.left.pixels, answer.pair.right.pixels
         due = at.steady - self._annotated_at >= self._annotated_period
-        if self.is_annotation_wanted and due and left is not None and right is not None:
+        if self.has_annotation_subscriber and due and left is not None and right is not None:
             self._annotated_at = at.steady
             picture = annotate(left, right, answer.measured)
             yield Publish(ANNOTATED, picture_message(picture, answer.pair.stamp))

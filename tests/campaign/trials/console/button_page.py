@@ -36,7 +36,7 @@ _PAGE = """<!doctype html>
 
 
 @contextlib.contextmanager
-def serving_button(
+def serve_button_page(
     on_state: Callable[[PageHold], None], on_notice: Callable[[str], None]
 ) -> Iterator[tuple[int, HoldServer]]:
     """Serve the page; yields its port and the hold server.

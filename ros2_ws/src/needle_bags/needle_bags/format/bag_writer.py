@@ -290,7 +290,7 @@ def standard_topic(name: str, type_name: str) -> BagTopic:
     return BagTopic(name, type_name, definition, store.hash_rihs01(type_name), (USUAL_QOS,))
 
 
-def standard_text(text: str) -> bytes:
+def string_message(text: str) -> bytes:
     """Return a std_msgs/String as CDR."""
     name = "std_msgs/msg/String"
     store = _jazzy()

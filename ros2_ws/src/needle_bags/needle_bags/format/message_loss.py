@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # A gap is final once this many messages have arrived after it.
-CERTAIN_AFTER = 5
+FINAL_AFTER = 5
 
 
 class SequenceGaps:
@@ -33,7 +33,7 @@ class SequenceGaps:
                 self._jump = None
                 return
             self._jump = (before, count, since + 1)
-            if since + 1 >= CERTAIN_AFTER:
+            if since + 1 >= FINAL_AFTER:
                 self._settle()
         if self._last is not None and number > self._last + 1:
             self._settle()

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from needle_bags.format.bag_writer import BagCopy, stamp_of, standard_text, standard_topic
+from needle_bags.format.bag_writer import BagCopy, stamp_of, standard_topic, string_message
 from needle_bags.reading.bag_messages import raw_as_sent, read_contents
 from needle_bags.reading.bag_reader import CALIBRATION, Run
 from needle_bags.recording.provenance import commit
@@ -71,7 +71,7 @@ def write_rerun(
         if name in shown_topics:
             continue
         if name == CALIBRATION:
-            data = standard_text(calibration)
+            data = string_message(calibration)
         if name in topics:
             stamp = stamp_of(data)
             if name not in TIP_TOPICS or stamp in answered:

@@ -37,7 +37,7 @@ from needle_core.component import Moment
 from needle_core.errors import UserError
 from needle_core.files.yaml_files import load_yaml, read_calibration
 from needle_core.messages import Text
-from needle_core.ros.parameters import OF_EVERY_NODE
+from needle_core.ros.parameters import COMMON_PARAMETERS
 from needle_core.settings.parameter_files import (
     Sections,
     missing_section_warning,
@@ -111,7 +111,7 @@ class Node:
         """Return the parameters as a dataclass; warn about those that no longer exist."""
         names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
         known = {name: value for name, value in self.values.items() if name in names}
-        unknown = [n for n in self.values if n not in names and not n.startswith(OF_EVERY_NODE)]
+        unknown = [n for n in self.values if n not in names and not n.startswith(COMMON_PARAMETERS)]
         refused = self.given.intersection(unknown)
         if refused:
             raise UserError(f"--params: {self.name} has no parameter {', '.join(sorted(refused))}")

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from needle_bags.format.bag_metadata import USUAL_QOS
-from needle_bags.format.bag_writer import BagWriter, standard_text, standard_topic
+from needle_bags.format.bag_writer import BagWriter, standard_topic, string_message
 from needle_bags.format.message_definitions import full_definition
 from needle_bags.reading.bag_messages import read_contents
 from needle_bags.recording import recording as recording_module
@@ -40,7 +40,7 @@ TOPIC = standard_topic("/t", TYPE)
 
 
 def received(number: int = 1, topic: str = "/t") -> Received:
-    return Received(topic, standard_text(str(number)), TIME, TIME)
+    return Received(topic, string_message(str(number)), TIME, TIME)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def texts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     channel = bag.add_topic(dataclasses.replace(TOPIC, offered_qos=offers))
     for number in range(200):
         time = TIME + number * 1000
-        bag.write(channel, standard_text(str(number)), time, time - 10)
+        bag.write(channel, string_message(str(number)), time, time - 10)
     bag.set_custom_data("run_info", "level: tip\nseed: 1\n")
     bag.close()
     return directory
@@ -75,7 +75,7 @@ def test_rosbags_reads_messages_and_qos(texts: Path) -> None:
         (connection,) = reader.connections
         assert (reader.message_count, reader.ros_distro) == (200, "jazzy")
     assert [time for _, time, _ in messages] == [TIME + n * 1000 for n in range(200)]
-    assert [bytes(data) for _, _, data in messages] == [standard_text(str(n)) for n in range(200)]
+    assert [bytes(data) for _, _, data in messages] == [string_message(str(n)) for n in range(200)]
     assert connection.digest == STORE.hash_rihs01(TYPE)
     first, second = connection.ext.offered_qos_profiles  # type: ignore[union-attr]
     assert (first.depth, first.reliability) == (10, QosReliability.RELIABLE)

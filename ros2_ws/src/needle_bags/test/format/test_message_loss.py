@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from needle_bags.format.message_loss import CERTAIN_AFTER, SequenceGaps
+from needle_bags.format.message_loss import FINAL_AFTER, SequenceGaps
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ def test_a_jump_before_the_discovery_of_a_publisher_is_no_gap() -> None:
 
 def test_a_gap_remains_after_a_change_of_publishers() -> None:
     gaps = SequenceGaps()
-    for number in (1, *range(4, 5 + CERTAIN_AFTER)):
+    for number in (1, *range(4, 5 + FINAL_AFTER)):
         gaps.add(number)
     gaps.reset()
     assert gaps.missing == 2

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_bags.format.bag_writer import BagCopy, BagWriter, standard_text, standard_topic
+from needle_bags.format.bag_writer import BagCopy, BagWriter, standard_topic, string_message
 from needle_bags.reading.bag_messages import raw_as_sent, read_contents
 from needle_bags.reading.bag_reader import _health_events, _series, read_run
 from needle_core.errors import UserError
@@ -94,7 +94,7 @@ def other_type(path: Path) -> None:
     bag = BagWriter(path)
     for name in ("/needle/controller_status", "/needle/tip"):
         topic = bag.add_topic(standard_topic(name, "std_msgs/msg/String"))
-        bag.write(topic, standard_text(""), 1, 1)
+        bag.write(topic, string_message(""), 1, 1)
     bag.close()
 
 

@@ -17,7 +17,7 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as OtherWriter
 
-from needle_bags.format.bag_writer import BagWriter, standard_text, standard_topic
+from needle_bags.format.bag_writer import BagWriter, standard_topic, string_message
 from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import bag_recovery, recover
@@ -118,7 +118,7 @@ def test_messages_compressed_one_by_one_are_recovered(tmp_path: Path) -> None:
     with writer:
         topic = writer.add_connection("/a", STRING.type_name, **told)
         for number in range(30):
-            writer.write(topic, 1000 + number, standard_text(f"message {number}"))
+            writer.write(topic, 1000 + number, string_message(f"message {number}"))
     (path / "metadata.yaml").unlink()
     assert recover_bag(path).kept == []
     messages = read_messages(path, "/a".__eq__)

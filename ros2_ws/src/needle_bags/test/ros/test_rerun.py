@@ -16,7 +16,7 @@ import yaml
 from rclpy.parameter import Parameter
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_writer import BagCopy, standard_text, standard_topic
+from needle_bags.format.bag_writer import BagCopy, standard_topic, string_message
 from needle_bags.link import openigtlink
 from needle_bags.live import live_view
 from needle_bags.reading.bag_messages import raw_as_sent, read_contents, read_messages
@@ -260,7 +260,7 @@ def test_the_calibration_is_that_of_the_tracker_or_of_params(
     with copied(
         eight_steps, bag, {"calibration": "left: {}"}, "/stereo_tracker/calibration", kind
     ) as put:
-        put(standard_text(text))
+        put(string_message(text))
     run = read_run(bag)
     assert run.calibration == text
     other = tmp_path / "other.yaml"

@@ -29,7 +29,7 @@ LAUNCHED_PACKAGES = {
 _NOT_FOR_RIGS = ("target_plane", "target_point")
 
 # Parameter that a file must not set -> its launch argument.
-_OF_SIMULATION = {
+_RESERVED_BY_SIMULATION = {
     "level": "level",
     "seed": "seed",
     "preset": "controller",
@@ -38,7 +38,11 @@ _OF_SIMULATION = {
     "channel": "can",
 }
 _CLOSE = 0.84  # similarity of a misspelt name; that of ros_namespace is lower
-_OF_RIG = {"calibration_file": "calibration", "registration_file": "registration", "bag": "bag"}
+_RESERVED_BY_RIG = {
+    "calibration_file": "calibration",
+    "registration_file": "registration",
+    "bag": "bag",
+}
 
 
 def refuse_misspelt(given: Iterable[str], declared: Sequence[str]) -> None:
@@ -98,7 +102,7 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     if bag is None:
         del parameters["recorder"]
         parameters.get("simulated_operator", {}).pop("wait_for_recorder", None)
-    return _with_file(parameters, arguments, _OF_SIMULATION)
+    return _with_file(parameters, arguments, _RESERVED_BY_SIMULATION)
 
 
 def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
@@ -132,7 +136,7 @@ def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
         parameters["recorder"] = {"bag": str(bag), "run_info": json.dumps(dict(arguments))}
     if arguments["drives"]:
         parameters.update(_read("drives", arguments, ["device_driver"]))
-    return _with_file(parameters, arguments, _OF_RIG)
+    return _with_file(parameters, arguments, _RESERVED_BY_RIG)
 
 
 def replayed_nodes(arguments: Mapping[str, str]) -> Parameters:

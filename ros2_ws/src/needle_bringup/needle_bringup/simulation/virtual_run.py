@@ -43,7 +43,7 @@ _SLICE = 1.0
 _END_TIMEOUT = 5.0
 """Time for the rig to end after the operator [s]."""
 # Parameters of the CAN adapter, which the virtual bus replaces.
-_OF_ADAPTER = ("pty",)
+_ADAPTER_PARAMETERS = ("pty",)
 
 
 def make_components(parameters: Parameters) -> list[Component]:
@@ -102,7 +102,7 @@ def _make_drives(parameters: Parameters) -> list[Component]:
 
     def settings(kind: type[Any], node: str, **own: str) -> Any:
         given = parameters.get(node, {}).items()
-        values = {k: v for k, v in given if k not in _OF_ADAPTER}
+        values = {k: v for k, v in given if k not in _ADAPTER_PARAMETERS}
         return settings_of(kind, {node: {**values, **own}}, node)
 
     driver = settings(DeviceDriverParameters, "device_driver", link="virtual", channel=CAN)

@@ -110,7 +110,7 @@ class HoldProtocol:
         self._end_if_stale(now)
         entry = self._pages[page]
         self._count += 1
-        entry.session.note_sent(self._count, now)
+        entry.session.record_sent(self._count, now)
         fields = {
             "count": self._count,
             "heard": entry.session.echoed,

@@ -131,9 +131,9 @@ class HoldServer:
         hosts = request.headers.get_all("Host")
         origins = request.headers.get_all("Origin")
         refusal = None
-        if len(hosts) != 1 or self._access.why_not_host(hosts[0]):
+        if len(hosts) != 1 or self._access.host_refusal(hosts[0]):
             refusal = HoldRefusal.HOST
-        elif len(origins) != 1 or self._access.why_not_origin(origins[0]):
+        elif len(origins) != 1 or self._access.origin_refusal(origins[0]):
             refusal = HoldRefusal.ORIGIN
         elif request.path != PATH:
             refusal = HoldRefusal.PATH

@@ -132,7 +132,7 @@ class PageSession:
         self.until = -math.inf
         self._armed = False
 
-    def note_sent(self, count: int, now: float) -> None:
+    def record_sent(self, count: int, now: float) -> None:
         """Record a sent count, which must be greater than all earlier ones on any connection."""
         self._sent.append((count, now))
 

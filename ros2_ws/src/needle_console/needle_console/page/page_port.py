@@ -105,11 +105,11 @@ class PagePort:
             self._was_released |= not hold.pressed
         self._arrive(self._take)
 
-    def why_no_hold(self, is_local: bool) -> str:
+    def hold_refusal(self, is_local: bool) -> str:
         """Return the reason why a page, `is_local` or remote, may only watch and stop, if any."""
         device = self._snapshot.device
         simulated = None if device is None else device.simulated
-        return self._settings.why_no_hold(simulated, is_local=is_local)
+        return self._settings.hold_refusal(simulated, is_local=is_local)
 
     def log(self, text: str, severity: str = "warning") -> None:
         """Add a line to the log."""

@@ -111,7 +111,7 @@ class ServedPagePort(PagePort):
         self._url = f"http://{settings.address}:{settings.port}/"
         access = settings.access()
         self._hold_server = HoldServer(
-            access, settings.hold_port, self.why_no_hold, self.set_hold, self.log
+            access, settings.hold_port, self.hold_refusal, self.set_hold, self.log
         )
         self.refusals = self._hold_server.counts
         try:

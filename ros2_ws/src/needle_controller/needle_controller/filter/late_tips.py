@@ -19,7 +19,7 @@ from needle_core.compiled import compiled
 FIRST, LAST = 0.004, 0.020
 """Range of insertion in which tips are evaluated; later, a needle is too bent [m]."""
 _LEAST_TIPS = 5
-_SURE = 3.0
+_SIGNIFICANCE = 3.0
 _OUTLIER = 4.0
 
 
@@ -90,7 +90,7 @@ def hidden_age(
     age = mean - slip * middle - of_entry * too_deep
     start_variance = noise * (1.0 - of_entry)
     std = math.sqrt(start_variance + noise / number + slip_variance * middle**2)
-    return float(age) if age > _SURE * std else 0.0
+    return float(age) if age > _SIGNIFICANCE * std else 0.0
 
 
 @compiled

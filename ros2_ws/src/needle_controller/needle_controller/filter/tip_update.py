@@ -43,8 +43,8 @@ _SMALLEST_LAG, _LARGEST_LAG = 0.001, 0.016
 OUTLIER_DENSITY = 4.0**-3
 """Outliers are spread over four times the claimed bound (sqrt(3) standard deviations)."""
 _NO_MASS = 1e-30
-_GIVEN_UP = 1e-3
-_REOPENED = 0.2
+_DROPPED_SHARE = 1e-3
+_RESTORED_SHARE = 0.2
 _FAR = 5.5
 DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 """Density of a standard normal variable at 0."""
@@ -309,8 +309,8 @@ def _update_noise_weights(h: Any, assumed: Any, work: Workspace) -> None:
         for m in range(NOISES):
             likely = (1.0 - h.outlier) * work.shares[i, m] + h.outlier * weights[i, m]
             # After an outlier, widen the weights of the noise models.
-            likely += _REOPENED * h.outlier * (assumed.noises[h.shape, 1, m] - likely)
-            weights[i, m] = likely if likely > _GIVEN_UP else 0.0
+            likely += _RESTORED_SHARE * h.outlier * (assumed.noises[h.shape, 1, m] - likely)
+            weights[i, m] = likely if likely > _DROPPED_SHARE else 0.0
             kept += weights[i, m]
         for m in range(NOISES):
             weights[i, m] /= kept

@@ -20,9 +20,9 @@ import numpy.typing as npt
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.laws.point_turns import (
     PointLawSettings,
+    desired_turn,
+    insertion_to_closest_point,
     mean_slack,
-    wanted_turn,
-    way_as_bent,
     write_need,
 )
 from needle_controller.laws.roll_law import allowed_turn, base_turn, heaviest, hypotheses_of
@@ -112,14 +112,14 @@ def point_turn(
     """
     ahead, need = _in_frame_of_tip(coordinates, target), np.empty(2)
     way = write_need(ahead, need)
-    left = way_as_bent(ahead, way, curvature)
+    left = insertion_to_closest_point(ahead, way, curvature)
     if way <= 0.0:
         return 0.0, left
     # Standard deviation of x + way sin(pitch)
     variance = uncertainty[0] + way * (2.0 * uncertainty[1] + way * uncertainty[2])
     std = math.sqrt(max(variance, 0.0))
     slack = mean_slack(torsions, settings.max_rotation_per_length)
-    wanted = wanted_turn(need, way, curvature, std, slack, rotation_left, settings)
+    wanted = desired_turn(need, way, curvature, std, slack, rotation_left, settings)
     least = settings.smallest_weight * heaviest(torsions)
     turns = weights = 0.0
     for k in range(torsions.size):

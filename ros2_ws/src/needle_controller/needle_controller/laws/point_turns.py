@@ -97,7 +97,7 @@ def write_need(target: Array, need: Array) -> float:
 
 
 @compiled
-def way_as_bent(target: Array, way: float, curvature: float) -> float:
+def insertion_to_closest_point(target: Array, way: float, curvature: float) -> float:
     """Return the insertion until the needle is closest to a target [m].
 
     If no arc of the needle leads there, this is the closest point of the tightest arc.
@@ -140,7 +140,7 @@ def mean_slack(torsions: Records, rate: float) -> float:
 
 
 @compiled
-def wanted_turn(
+def desired_turn(
     need: Array,
     left: float,
     curvature: float,

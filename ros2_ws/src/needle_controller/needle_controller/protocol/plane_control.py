@@ -183,7 +183,7 @@ class PlaneControl:
         """Whether a tip was used since the last restart."""
         return self._joints is not None
 
-    def reason_of_roll(self, rotation: float) -> str:
+    def roll_problem(self, rotation: float) -> str:
         """Return why a needle cannot enter with its base at `rotation` [rad]; empty if it can."""
         start = self._plane.T_plane_rig[:3, :3] @ rotation_from_angles([0.0, 0.0, rotation])
         roll = float(np.arctan2(-start[0, 1], start[0, 0]))
@@ -265,7 +265,7 @@ class PlaneControl:
         matrix = turn @ covariance.matrix @ turn.T + np.eye(3) * settings.measurement_std**2
         self._estimator.correct(position, matrix)
 
-    def reason_without_path(self, rotation: float) -> str:
+    def path_problem(self, rotation: float) -> str:
         """Return why a needle before insertion has no path to its point; empty if it has one.
 
         Parameters

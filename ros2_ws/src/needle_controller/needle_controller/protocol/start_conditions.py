@@ -84,8 +84,6 @@ def _needle_reason(joints: JointSample, control: PlaneControl, settings: Steerin
             f"withdraw it first (<= {settings.needle_out_insertion:g} m)"
         )
     try:
-        return control.reason_of_roll(joints.rotation) or control.reason_without_path(
-            joints.rotation
-        )
+        return control.roll_problem(joints.rotation) or control.path_problem(joints.rotation)
     except OwnPartError as error:
         return str(error)

@@ -16,8 +16,8 @@ from needle_controller.laws.point_law import PointLaw
 from needle_controller.laws.point_turns import (
     PointLawSettings,
     affordable_reserve,
+    insertion_to_closest_point,
     rest_after,
-    way_as_bent,
     write_need,
 )
 from needle_controller.many_needles import ManyFilters
@@ -79,7 +79,9 @@ def test_an_unreachable_point_is_nearest_at_the_returned_length() -> None:
     for target in ((0.0, -0.003, 0.005), (0.06, 0.0, 0.03), (0.0, 0.0, 0.05)):
         aside, ahead = np.hypot(target[0], target[1]), target[2]
         nearest = np.argmin(np.hypot(x - aside, z - ahead)) // len(bend)
-        found = way_as_bent(np.array(target), write_need(np.array(target), np.empty(2)), CURVATURE)
+        found = insertion_to_closest_point(
+            np.array(target), write_need(np.array(target), np.empty(2)), CURVATURE
+        )
         assert found == pytest.approx(lengths[nearest, 0], abs=1e-4)
 
 

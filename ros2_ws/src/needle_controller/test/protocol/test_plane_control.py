@@ -241,7 +241,7 @@ def test_new_settings_keep_point_and_obstacles_unless_they_change_them() -> None
 def test_the_needle_reaches_a_point_past_an_obstacle() -> None:
     settings = dataclasses.replace(TO_PAST, target_offset=0.004)
     needle = Needle(settings, starts_deg=10.0)
-    assert needle.control.reason_without_path(0.0) == ""
+    assert needle.control.path_problem(0.0) == ""
     needle.steer()
     assert not needle.blocked
     assert needle.off(PAST) < 0.001
@@ -265,15 +265,15 @@ def test_a_new_wall_stops_the_needle_before_it() -> None:
 def test_the_reason_without_path_names_an_entry_with_a_path() -> None:
     control = PlaneControl(TO_PAST, offset_plane(0.0))
     control.obstacles = Obstacles([Obstacle(PAST, PAST, 0.004)])
-    assert "the target point is -0.004 m from an obstacle" in control.reason_without_path(0.0)
+    assert "the target point is -0.004 m from an obstacle" in control.path_problem(0.0)
     control.obstacles = Obstacles([Obstacle((0.0, 0.0, 0.003), (0.0, 0.0, 0.003), 0.004)])
-    assert "the entry is -0.001 m from an obstacle" in control.reason_without_path(0.0)
+    assert "the entry is -0.001 m from an obstacle" in control.path_problem(0.0)
     # A wall that ends at y = 6 mm: from an entry farther in +y there is room beside it.
     control.obstacles = Obstacles(
         [Obstacle((-0.06, y, 0.025), (0.06, y, 0.025), 0.011) for y in (-0.045, -0.025, -0.005)]
     )
     control.target_point = np.array([0.0, 0.008, 0.1])
-    said = control.reason_without_path(0.0)
+    said = control.path_problem(0.0)
     assert "m instead of (0, 0)" in said
     x, y = (float(part) for part in said.split("entry at (")[1].split(") m")[0].split(","))
     assert y > 0.0
@@ -285,4 +285,4 @@ def test_the_reason_without_path_names_an_entry_with_a_path() -> None:
             for row in control.obstacles.table
         ]
     )
-    assert control.reason_without_path(0.0) == ""
+    assert control.path_problem(0.0) == ""

@@ -157,5 +157,5 @@ def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.Monk
         rig.run(sent(actions))
     assert "IDLE: no path from insertion 0.0" in logged(actions)
     assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-    said = steering.control.reason_without_path(0.0)
+    said = steering.control.path_problem(0.0)
     assert "no path to the target point is clear of the 3 obstacles, nor from any entry" in said

@@ -21,7 +21,7 @@ from needle_core.settings.parameter_files import check_command_line
 P = TypeVar("P")
 
 _SIM_TIME = "use_sim_time"
-OF_EVERY_NODE = (_SIM_TIME, "start_type_description_service", "qos_overrides.")
+COMMON_PARAMETERS = (_SIM_TIME, "start_type_description_service", "qos_overrides.")
 """Prefixes of the parameters that every rclpy node declares itself."""
 
 
@@ -117,7 +117,7 @@ def _plain(value: Any) -> Any:
 def _reject_unknown(node: Node, known: list[str]) -> None:
     # rclpy silently drops undeclared overrides: a misspelt gain would have no effect.
     for name in node._parameter_overrides:
-        if name not in known and not name.startswith(OF_EVERY_NODE):
+        if name not in known and not name.startswith(COMMON_PARAMETERS):
             hint = did_you_mean(name, known)
             raise UserError(
                 f"{node.get_fully_qualified_name()}: unknown parameter '{name}' ({hint})"

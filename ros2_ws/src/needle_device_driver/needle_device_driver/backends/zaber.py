@@ -28,7 +28,7 @@ _WIDE = 1_000_000_000
 
 # Smallest ratio of a move's speed to that of the previous move: the drive's ramp delays the motion,
 # and the slow last set-points must make up for it.
-_SLOWING = 0.8
+_MIN_SPEED_RATIO = 0.8
 
 # Number of message ids each for positions, other states and procedures; orders have id 0.
 _CYCLIC_IDS = 33
@@ -224,7 +224,7 @@ class ZaberProtocol(DriveProtocol):
     def move_to(self, axis: str, position: int, speed: int) -> None:
         """Send a point move with its own speed."""
         at = self._axes[axis]
-        at.speed = max(speed, round(_SLOWING * at.speed))
+        at.speed = max(speed, round(_MIN_SPEED_RATIO * at.speed))
         self._order(axis, f"move abs {position} {_speed(at.speed)}")
 
     def stop(self, axis: str) -> None:

@@ -67,13 +67,13 @@ class DriveMachine:
         self._transitions = TransitionMonitor()
         self._goal = Goal.OFF
         self._cycles = 0
-        self._via_off = False
+        self._switched_off_temporarily = False
         self._stopping = False
         self._still_cycles = 0
         self._cycles_in_stop = 0
         self._rested = True
         self._track: deque[int] = deque(maxlen=_WINDOW + 1)
-        self._runs_on = False
+        self._ignores_stop = False
         self._sent_mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
         self.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
         self.at = at
@@ -100,12 +100,12 @@ class DriveMachine:
         """Whether the drive is on because of the present order, moving or stopped."""
         # Excludes a drive that is still on from before, or in another mode.
         on = self.state in POWERED and self.at.mode == self.mode
-        return self._goal is not Goal.OFF and (on or self._via_off)
+        return self._goal is not Goal.OFF and (on or self._switched_off_temporarily)
 
     @property
     def released_after_block(self) -> bool:
         """Whether the drive is switched off because the axis was stopped while blocked."""
-        return self._goal is Goal.STOPPED and self._via_off
+        return self._goal is Goal.STOPPED and self._switched_off_temporarily
 
     @property
     def stop_failure(self) -> str:
@@ -130,7 +130,7 @@ class DriveMachine:
         """Set the goal."""
         if goal is not self._goal:
             # A released axis still counts as powered while it is switched on again.
-            self._via_off = self.released_after_block and goal is Goal.ON
+            self._switched_off_temporarily = self.released_after_block and goal is Goal.ON
             self._goal = goal
             self._cycles = 0
             self._rested = False
@@ -147,14 +147,14 @@ class DriveMachine:
         self.set_goal(Goal.OFF)
         self._stopping = False
         self._still_cycles = 0
-        self._runs_on = False
+        self._ignores_stop = False
         self.at = at
         self.target = at.position
         self.problem = ""
 
     def next_order(self) -> tuple[DriveCommand, Mode]:
         """Return the command and the mode to send now."""
-        command = DriveCommand.DISABLE_VOLTAGE if self._runs_on else self._next_command()
+        command = DriveCommand.DISABLE_VOLTAGE if self._ignores_stop else self._next_command()
         self._transitions.note_command(command)
         # A powered drive keeps its mode: its set-point may belong to that mode.
         if self.state not in POWERED:
@@ -198,7 +198,7 @@ class DriveMachine:
         if state is not DriveState.QUICK_STOP_ACTIVE:
             longest += _MAX_STOP_DELAY
         if self._cycles_in_stop >= longest and self._keeps_moving:
-            self._runs_on = True
+            self._ignores_stop = True
             distance = abs(self._track[-1] - self._track[0])
             when = "in its quick stop" if state is DriveState.QUICK_STOP_ACTIVE else "when stopped"
             self._set_problem(
@@ -210,7 +210,7 @@ class DriveMachine:
         homing = self.mode is Mode.HOMING and self.at.mode == Mode.HOMING
         if self.ready or (homing and state is DriveState.OPERATION_ENABLED):
             self._cycles = 0
-            self._via_off = False
+            self._switched_off_temporarily = False
             return
         if (
             self._goal is Goal.ON
@@ -219,16 +219,16 @@ class DriveMachine:
             and self._still_cycles > _REST
         ):
             # Transition 16 is optional: without it, go through SWITCH ON DISABLED.
-            self._via_off = True
+            self._switched_off_temporarily = True
         if (
             self._goal is Goal.STOPPED
             and self._still_cycles >= _REST
             and abs(self.at.following_error) > self._rest_counts
         ):
             # The axis is blocked: the drive would move it as soon as it is freed.
-            self._via_off = True
+            self._switched_off_temporarily = True
         if self.switching and state not in FAULTS and self._cycles > _MAX_SWITCHING:
-            self._runs_on = self._runs_on or self._goal is not Goal.ON
+            self._ignores_stop = self._ignores_stop or self._goal is not Goal.ON
             self._set_problem(
                 f"is not {self._goal.value} after {_MAX_SWITCHING * self._period:g} s: "
                 f"{state.name}, mode {self.at.mode}"
@@ -239,7 +239,9 @@ class DriveMachine:
         state = self.state
         if self._stopping:
             return DriveCommand.QUICK_STOP
-        if self.released_after_block or (self._via_off and state is DriveState.QUICK_STOP_ACTIVE):
+        if self.released_after_block or (
+            self._switched_off_temporarily and state is DriveState.QUICK_STOP_ACTIVE
+        ):
             return DriveCommand.DISABLE_VOLTAGE
         at_rest = self._still_cycles >= _REST
         if self._goal is not Goal.ON:

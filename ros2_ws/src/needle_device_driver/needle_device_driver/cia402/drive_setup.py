@@ -171,11 +171,11 @@ def _set_up_motion(
         wanted.append((od.MAX_TORQUE, torque, (torque // 2 + 1, 2 * torque)))
     missing = []
     for entry, value, accepted in wanted:
-        missing.append((yield from _write_wanted(access, entry, value, accepted)))
+        missing.append((yield from _write_optional_object(access, entry, value, accepted)))
     return [text for text in missing if text]
 
 
-def _write_wanted(
+def _write_optional_object(
     access: ObjectAccess, entry: od.Entry, value: int, accepted: tuple[int, int] | None
 ) -> Procedure[str]:
     """Write an object; return a note if it is missing, or refused and not needed by a rule."""

@@ -194,7 +194,7 @@ class DeviceCore:
             except AxisError as error:
                 return str(error)
             problem = axes_problem(
-                self.poll(now), now, self._limits, powered_wanted=False, homed_wanted=False
+                self.poll(now), now, self._limits, require_power=False, require_home=False
             )
             if problem is not None:
                 return problem[1]
@@ -359,8 +359,8 @@ class DeviceCore:
             now,
             self._limits,
             # Switching on takes time: only a loss of power counts.
-            powered_wanted=on and self._was_powered,
-            homed_wanted=self.activity is Activity.STEP,
+            require_power=on and self._was_powered,
+            require_home=self.activity is Activity.STEP,
         )
         self._was_powered = on and (self._was_powered or at.powered)
         reported, self._released_after_block = self._released_after_block, at.released_after_block

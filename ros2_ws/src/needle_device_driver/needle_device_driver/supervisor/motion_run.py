@@ -19,7 +19,7 @@ _OFF_SWITCH = 0.25
 
 
 def axes_problem(
-    at: PairSnapshot, now: float, limits: SafetyLimits, *, powered_wanted: bool, homed_wanted: bool
+    at: PairSnapshot, now: float, limits: SafetyLimits, *, require_power: bool, require_home: bool
 ) -> Problem | None:
     """Return the rule that the axes break, and how."""
     if at.fault:
@@ -29,9 +29,9 @@ def axes_problem(
             Rule.REPLY_AGE,
             f"no reply from an axis for {at.age(now):.3f} s, limit {limits.reply_age_limit:g} s",
         )
-    if powered_wanted and not at.powered:
+    if require_power and not at.powered:
         return Rule.ONE_FAULT_STOPS_BOTH, "an axis lost its power"
-    if homed_wanted and not at.homed:
+    if require_home and not at.homed:
         return Rule.ONE_FAULT_STOPS_BOTH, "an axis lost its home position"
     return None
 

@@ -168,7 +168,7 @@ class DriveBench(SupervisorBench):
         self.bus.flush()
         self.go()
 
-    def obeys_late(self, drive: ScriptedDrive, seconds: float) -> None:
+    def delay_reaction(self, drive: ScriptedDrive, seconds: float) -> None:
         """Delay the reaction of a drive to a command by some time [s]; then it is off."""
         due = math.inf
 

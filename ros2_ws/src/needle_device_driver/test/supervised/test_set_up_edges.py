@@ -20,7 +20,7 @@ def test_powered_drive_has_a_second_to_switch_off(seconds: float, is_off: bool) 
     bench = DriveBench()
     bench.insertion.state = "enabled"
     bench.sdo_time = 0.02
-    bench.obeys_late(bench.insertion, seconds)
+    bench.delay_reaction(bench.insertion, seconds)
     reply = bench.configure()
     assert (reply.success, "does not switch off" in reply.message) == (is_off, not is_off)
 

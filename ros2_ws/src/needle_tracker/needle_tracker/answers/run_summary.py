@@ -24,7 +24,7 @@ _INSIDE_95 = 7.814728
 
 
 @dataclasses.dataclass
-class SeenCounts:
+class DetectionCounts:
     """Counts of detected ends and shafts, except in the entry zone."""
 
     pairs: int = 0
@@ -75,13 +75,13 @@ class TruthComparison:
         self._tips = tips
         self._errors: list[Array] = []
         self._squares: list[float] = []
-        self._missed = self._false = self._untold = 0
+        self._missed = self._false = self._without_truth = 0
 
     def add(self, names: Sequence[str], measured: Measurement) -> None:
         """Add the result of a pair by any of its names; a tip in the entry zone does not count."""
         key = next((name for name in names if name in self._tips), None)
         if key is None:
-            self._untold += 1
+            self._without_truth += 1
             return
         true, tip = self._tips[key], measured.tip
         if tip is None or measured.state is TrackState.ENTRY:
@@ -104,7 +104,7 @@ class TruthComparison:
             "compared": len(self._errors),
             "missed": self._missed,
             "tips_without_needle": self._false,
-            "without_truth": self._untold,
+            "without_truth": self._without_truth,
             "error_rms_mm": math.sqrt(float(np.mean(size**2))),
             "error_p95_mm": float(np.percentile(size, 95.0)),
             "error_max_mm": float(np.max(size)),

@@ -23,7 +23,7 @@ from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import missing_section_warning, read_sections, values_for
 from needle_tracker.answers.annotation import annotate, missing
 from needle_tracker.answers.pair_answers import SUSPICION, SwapWatch
-from needle_tracker.answers.run_summary import SeenCounts, TruthComparison, read_truth
+from needle_tracker.answers.run_summary import DetectionCounts, TruthComparison, read_truth
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
@@ -107,7 +107,7 @@ def _run(given: argparse.Namespace) -> int:
     begin = time.perf_counter()
     rows: list[list[str]] = []
     unusable: list[str] = []
-    without, stage, seen = 0, (0.0, 0.0), SeenCounts()
+    without, stage, seen = 0, (0.0, 0.0), DetectionCounts()
     swap = SwapWatch(calibration, parameters)
     for pair, insertion, measured in track(pairs, tracker, calibration.sizes, insertions):
         without += insertion is None

@@ -24,7 +24,7 @@ from needle_tracker.calibrating.calibration_outliers import contradictions, misf
 from needle_tracker.calibrating.calibration_session import (
     KINDS,
     load_session,
-    nothing_seen,
+    no_board_detected,
     views_in_folders,
 )
 from needle_tracker.calibrating.calibration_start import PairsApartError, describe_apart
@@ -102,7 +102,7 @@ def _run(options: Namespace) -> int:
     options.output = output_file("--output", options.output)
     session = load_session(options.session)
     views, sizes = views_in_folders(options.left, options.right, session)
-    empty = [view.name for view in views if nothing_seen(view) and view.place is None]
+    empty = [view.name for view in views if no_board_detected(view) and view.place is None]
     if empty:
         print(f"left out, no board found: {', '.join(empty)}")
     views = [view for view in views if view.name not in empty]

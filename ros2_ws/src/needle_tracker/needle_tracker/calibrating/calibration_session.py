@@ -311,7 +311,7 @@ def views_in_folders(
             seen.append(Corners(session.board.corners[numbers], pixels))
         names = [Path(path).stem for path in (pair.name, *pair.files)]
         views.append(BoardView(names[0], session.place_of(*names), *seen))
-    if all(nothing_seen(view) for view in views):
+    if all(no_board_detected(view) for view in views):
         raise _no_board(session)
     used = [view.place for view in views]
     for name, place in session.places.items():
@@ -320,7 +320,7 @@ def views_in_folders(
     return views, sizes
 
 
-def nothing_seen(view: BoardView) -> bool:
+def no_board_detected(view: BoardView) -> bool:
     """Return whether neither camera detected the board."""
     return not np.any([len(view.corners(side).points) for side in SIDES])
 
@@ -348,7 +348,7 @@ def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) ->
         pixels = np.array([np.mean(found[n], axis=0) for n in kept]).reshape(-1, 2)
         seen.append(Corners(session.board.corners[kept], pixels))
     view = BoardView(name, session.place_of(name), seen[0], seen[1])
-    if nothing_seen(view):
+    if no_board_detected(view):
         raise _no_board(session)
     return view
 

@@ -106,7 +106,7 @@ def anchor_view(views: list[BoardView], surface: Window | None) -> BoardView | N
     return next(iter(in_air if surface else in_air + known), None)
 
 
-def cameras_alone(
+def calibrate_lenses(
     views: list[BoardView], sizes: dict[str, tuple[int, int]], windows: tuple[Window, Window]
 ) -> StereoCalibration:
     """Return the lenses of both cameras, from the views in air (Zhang's method, OpenCV).
@@ -188,10 +188,10 @@ def first_calibration(
             )
         placed.append(camera)
     calibration = StereoCalibration(*placed)
-    return calibration, boards_seen(calibration, views)
+    return calibration, initial_board_poses(calibration, views)
 
 
-def boards_seen(calibration: StereoCalibration, views: list[BoardView]) -> Array:
+def initial_board_poses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
     """Return T_rig_board of each view, shape (n, 4, 4): as given, else from one camera.
 
     Parameters
@@ -327,7 +327,8 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
     all views, or else of one other view, and grows until it no longer changes.
     """
     left, right = (
-        boards_seen(cameras, [view.without(other) for view in views]) for other in SIDES[::-1]
+        initial_board_poses(cameras, [view.without(other) for view in views])
+        for other in SIDES[::-1]
     )
     limits = 2.0 * _alone(cameras, views) + _SLACK_PX
     poses = right @ np.linalg.inv(left)
@@ -370,7 +371,7 @@ def _alone(calibration: StereoCalibration, views: list[BoardView]) -> Array:
 
 def _misses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
     """Return the rms corner error of each view at the best-fitting pose of the board [px]."""
-    model = RigModel(calibration, views, boards_seen(calibration, views))
+    model = RigModel(calibration, views, initial_board_poses(calibration, views))
     free = board_parameters_free(model)
     if any(view.under_surface for view in views):
         # With one flat board, index and height of the surface are indistinguishable.

@@ -16,7 +16,7 @@ from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.calibration_start import (
     LEAST_FREE_VIEWS,
     are_posed,
-    cameras_alone,
+    calibrate_lenses,
     checked_views,
     consistent_views,
     first_calibration,
@@ -148,7 +148,7 @@ def calibrate(
     """
     least_free = LEAST_FREE_VIEWS if lenses is None else 0
     views = checked_views(views, common_surface(*windows), least_free)
-    cameras = lenses or cameras_alone(views, sizes, windows)
+    cameras = lenses or calibrate_lenses(views, sizes, windows)
     views, apart, seen = consistent_views(views, cameras, least_free)
     tied = are_posed(cameras)
     if tied and seen is not None:

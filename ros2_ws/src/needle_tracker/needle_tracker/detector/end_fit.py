@@ -278,7 +278,7 @@ def _end_on_line(
             total += _on_line(ends, point, direction, s, centre + t)
             t += 1.0
         density[i] = total
-    _keep_about_the_most(density, width)
+    _keep_densest_interval(density, width)
     known = density.sum()
     flat = max(FIT.hidden_end, 1.0 - known) if known < FIT.hidden_end else FIT.hidden_end
     for i in range(count):
@@ -291,7 +291,7 @@ def _end_on_line(
 
 
 @compiled
-def _keep_about_the_most(density: Array, width: float) -> None:
+def _keep_densest_interval(density: Array, width: float) -> None:
     """Set the density to 0 outside the interval with the largest sum.
 
     A wide window may show two ends, and their median would be at neither.

@@ -225,7 +225,7 @@ class NeedleTracker:
             # A lamp was switched or a camera was bumped: most new lines are not the needle.
             self._tracks = [track.missed() for track in self._tracks]
             return self._answer(None, NoTip.CHANGED)
-        found, ends = self._look_everywhere(insertion)
+        found, ends = self._search_images(insertion)
         return self._answer(found, "", ends)
 
     def _view_changed(self, pair: Pair) -> bool:
@@ -242,7 +242,7 @@ class NeedleTracker:
             for now, then in zip(self._views_before, before, strict=True)
         )
 
-    def _look_everywhere(self, insertion: float | None) -> tuple[Sighting | None, Ends]:
+    def _search_images(self, insertion: float | None) -> tuple[Sighting | None, Ends]:
         """Search both images; return the best sighting and the best end of each view."""
         settings = self.settings
         least, most = settings.hole_clearance, settings.max_insertion

@@ -149,7 +149,7 @@ def _seen(
 
 
 @compiled
-def see_through(camera: Array, points: Array, seen: Array) -> None:
+def apparent_points(camera: Array, points: Array, seen: Array) -> None:
     """Write the points of the outer face at which points appear.
 
     Parameters
@@ -371,7 +371,7 @@ class RefractedCamera:
         """
         points = np.ascontiguousarray(points, dtype=np.float64)
         seen = np.empty(points.shape)
-        see_through(self.packed, points.reshape(-1, 3), seen.reshape(-1, 3))
+        apparent_points(self.packed, points.reshape(-1, 3), seen.reshape(-1, 3))
         return seen
 
     def jacobian(self, point: Array) -> Array:

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from needle_tracker.answers.annotation import annotate, describe, describe_view, missing
-from needle_tracker.answers.run_summary import SeenCounts
+from needle_tracker.answers.run_summary import DetectionCounts
 from needle_tracker.answers.track_images import COLUMNS, to_row
 from needle_tracker.answers.tracker_messages import (
     ROLL_VARIANCE,
@@ -92,7 +92,7 @@ def test_the_reason_for_no_tip_depends_on_the_views(
 
 
 def test_counts_include_all_processed_pairs() -> None:
-    counts = SeenCounts()
+    counts = DetectionCounts()
     for measured in (
         *[nothing(END, HIDDEN)] * 3,
         Measurement(None, TrackState.CONFIRMING, NoTip.UNCONFIRMED, (END, END)),

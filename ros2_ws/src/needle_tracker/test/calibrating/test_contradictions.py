@@ -21,7 +21,7 @@ from needle_tracker.optics.calibration import StereoCalibration
 from synthetic_rig import GIVEN, PLACES, SIZES, free_pose, lenses_of, take, view_of
 
 
-def said_larger(views: list[BoardView], share: float) -> list[BoardView]:
+def with_larger_squares(views: list[BoardView], share: float) -> list[BoardView]:
     """Return views of a board whose squares are stated larger than they are."""
     return [
         dataclasses.replace(
@@ -37,7 +37,7 @@ def test_wrong_squares_are_found_by_their_size(
     views: list[BoardView], calibration: StereoCalibration
 ) -> None:
     """An error of 0.3 % is 0.4 mm at the tip, but only 0.01 px more reprojection error."""
-    result = calibrate(said_larger(views[4:], 0.003), SIZES, GIVEN, lenses_of(calibration))
+    result = calibrate(with_larger_squares(views[4:], 0.003), SIZES, GIVEN, lenses_of(calibration))
     error, sigma = square_error(result)
     assert error == pytest.approx(-0.003, abs=max(4.0 * sigma, 3e-4))
     assert "smaller than in the session" in contradictions(result, (error, sigma))[0]
@@ -46,7 +46,7 @@ def test_wrong_squares_are_found_by_their_size(
 def test_one_place_does_not_determine_the_size_of_the_squares(
     views: list[BoardView], calibration: StereoCalibration
 ) -> None:
-    found = said_larger(views[2:7], 0.01)
+    found = with_larger_squares(views[2:7], 0.01)
     result = calibrate(found, SIZES, GIVEN, lenses_of(calibration))
     size = square_error(result)
     assert not size[1] < 0.1

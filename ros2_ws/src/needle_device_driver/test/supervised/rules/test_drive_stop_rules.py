@@ -237,7 +237,7 @@ def test_drive_emergency_reset_may_take_a_second(seconds: float, leaves: bool) -
     bench.hold(False)
     bench.wait(5)
     bench.sdo_time = 0.02
-    bench.obeys_late(bench.insertion, seconds)
+    bench.delay_reaction(bench.insertion, seconds)
     assert bench.reset().success is leaves
 
 
