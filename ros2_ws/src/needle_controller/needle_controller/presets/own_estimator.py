@@ -104,7 +104,7 @@ class OwnEstimator:
 
 
 @cache
-def tested_estimator(name: str) -> OwnPart:
+def checked_estimator(name: str) -> OwnPart:
     """Return the class of an estimator of another package, after a trial with one needle.
 
     Raises

@@ -63,7 +63,7 @@ class OwnLaw:
 
 
 @cache
-def tested_law(name: str) -> OwnPart:
+def checked_law(name: str) -> OwnPart:
     """Return the class of a law of another package, after a trial.
 
     Raises

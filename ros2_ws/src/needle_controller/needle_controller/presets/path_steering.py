@@ -84,7 +84,7 @@ class OwnPlanner:
 
 
 @cache
-def tested_planner(name: str) -> OwnPart:
+def checked_planner(name: str) -> OwnPart:
     """Return the class of a planner of another package, after a trial with a straight path.
 
     Raises
@@ -138,7 +138,7 @@ class PathSteering:
         self._planner = path_planner(settings)
         self._own = None
         if settings.planner:
-            self._own = OwnPlanner(tested_planner(settings.planner), settings)
+            self._own = OwnPlanner(checked_planner(settings.planner), settings)
         self._law = prompt_point_law(settings)
         self.path: NeedlePath | None = None
         self.last_route: Route | None = None

@@ -13,7 +13,7 @@ from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import WINDOW, TargetMotion
 from needle_controller.observers.estimator import Estimate
-from needle_controller.presets.own_law import OwnLaw, tested_law
+from needle_controller.presets.own_law import OwnLaw, checked_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 _ITERATIONS = 4
@@ -142,7 +142,7 @@ class PointSteering(ArrivalPrediction):
 def point_law(settings: SteeringSettings) -> LawToPoint:
     """Return the law for points of checked settings."""
     if settings.law:
-        return OwnLaw(tested_law(settings.law), settings).to_point
+        return OwnLaw(checked_law(settings.law), settings).to_point
     return PointLaw(PointLawSettings(**settings.turning))
 
 

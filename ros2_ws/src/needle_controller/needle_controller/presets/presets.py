@@ -13,8 +13,8 @@ from needle_controller.laws.roll_law import RollLaw, RollLawSettings
 from needle_controller.model.gains import Gains
 from needle_controller.observers.estimator import Estimator
 from needle_controller.observers.luenberger import LuenbergerObserver, LuenbergerSettings
-from needle_controller.presets.own_estimator import OwnEstimator, tested_estimator
-from needle_controller.presets.own_law import OwnLaw, tested_law
+from needle_controller.presets.own_estimator import OwnEstimator, checked_estimator
+from needle_controller.presets.own_law import OwnLaw, checked_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 
@@ -91,11 +91,11 @@ def make_controller(
     """
     estimator, law = _of_preset(settings, initial_rotation, entry)
     if settings.estimator:
-        part = tested_estimator(settings.estimator)
+        part = checked_estimator(settings.estimator)
         rng = np.random.default_rng([settings.seed, number])
         estimator = OwnEstimator(part, settings, initial_rotation, entry, rng)
     if settings.law:
-        law = OwnLaw(tested_law(settings.law), settings)
+        law = OwnLaw(checked_law(settings.law), settings)
     return estimator, law
 
 

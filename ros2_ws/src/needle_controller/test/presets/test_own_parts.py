@@ -15,10 +15,10 @@ import pytest
 from needle_controller.observers.estimator import pose_estimate
 from needle_controller.planning.entry import entry_state
 from needle_controller.planning.obstacles import Obstacle, Obstacles
-from needle_controller.presets.own_estimator import tested_estimator
-from needle_controller.presets.own_law import OwnLaw, tested_law
+from needle_controller.presets.own_estimator import checked_estimator
+from needle_controller.presets.own_law import OwnLaw, checked_law
 from needle_controller.presets.own_parts import GROUPS, OwnPartError
-from needle_controller.presets.path_steering import PathSteering, tested_planner
+from needle_controller.presets.path_steering import PathSteering, checked_planner
 from needle_controller.presets.point_steering import prompt_point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
@@ -152,7 +152,7 @@ def test_an_own_estimator_may_use_a_measured_heading(offer: Offer) -> None:
         assert estimator.estimate().rotation[2, 2] == pytest.approx(z, abs=1e-4)
     wrong = offer("estimator", own.replace("(self, direction, variance)", "(self, direction)"))
     with pytest.raises(OwnPartError, match="correct_heading raised TypeError"):
-        tested_estimator(wrong)
+        checked_estimator(wrong)
 
 
 def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
@@ -177,7 +177,7 @@ def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
         assert sound in ESTIMATOR
         name = offer("estimator", ESTIMATOR.replace(sound, wrong))
         with pytest.raises(OwnPartError, match=rf"^estimator '{name}") as error:
-            tested_estimator(name)
+            checked_estimator(name)
         text = str(error.value)
         assert said in text
         assert "docs/own_controllers.md" in text
@@ -196,7 +196,7 @@ def test_a_name_is_offered_by_one_package_and_is_a_class(offer: Offer) -> None:
         SteeringSettings(law="both")
     function = offer("law", "def Own(estimate):\n    return 0.0\n")
     with pytest.raises(OwnPartError, match=r"is a function, expected a class .* \(settings\)"):
-        tested_law(function)
+        checked_law(function)
 
 
 def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) -> None:
@@ -206,7 +206,7 @@ def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) ->
     assert float(law(estimate, 0.1).rotation_rate) == pytest.approx(4.0)
     assert float(law(estimate, 1.0).rotation_rate) == 10.0
     for to_point in (
-        OwnLaw(tested_law(settings.law), settings).to_point,
+        OwnLaw(checked_law(settings.law), settings).to_point,
         prompt_point_law(settings),
     ):
         # A quarter of a circle of 50 mm radius, straight ahead, and behind.
@@ -229,7 +229,7 @@ def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
         ("estimate.speed", "to_plane(estimate, insertion) raised AttributeError"),
     ):
         with pytest.raises(OwnPartError) as error:
-            tested_law(offer("law", LAW.replace(rate, wrong)))
+            checked_law(offer("law", LAW.replace(rate, wrong)))
         assert said in str(error.value)
     # A law for planes alone is not tried with a point.
     name = offer("law", LAW.replace("def to_point", "def not_to_point"))
@@ -257,4 +257,4 @@ def test_an_own_planner_steers_by_its_via_points(offer: Offer) -> None:
     assert none == f"planner {settings.planner} finds no path to the target point past 2 obstacles"
     name = offer("planner", PLANNER.replace("return [target]", "return [target + 0.01]"))
     with pytest.raises(OwnPartError, match=r"does not end at the target \[0.0, 0.0, 0.08\] m"):
-        tested_planner(name)
+        checked_planner(name)
