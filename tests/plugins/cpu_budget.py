@@ -76,7 +76,6 @@ class CpuBudget:
 
     def __init__(self) -> None:
         self.is_enforced = False
-        self._slowness = 1.0
         self._shared = 0.0
         self._begin = 0.0
         self._used: Counter[str] = Counter()
@@ -119,11 +118,8 @@ class CpuBudget:
             whole = _cpu() - self._begin
             own, limit = whole - self._shared, _layer(item.nodeid).each
             report.user_properties.append((_CPU, whole))
-            if self.is_enforced and own > limit:
-                # The load may have ended together with the test.
-                self._slowness = max(self._slowness, _slowness())
-                if own > TOLERANCE * limit * self._slowness:
-                    report.user_properties.append((_OVER, own))
+            if self.is_enforced and own > limit and own > TOLERANCE * limit * _slowness():
+                report.user_properties.append((_OVER, own))
         return report
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -174,7 +170,7 @@ def _slowness() -> float:
     """Return the present slowness relative to the nominal machine."""
     begin = time.process_time()
     _reference()
-    return (time.process_time() - begin) / NOMINAL
+    return max(1.0, (time.process_time() - begin) / NOMINAL)
 
 
 def _reference() -> float:
