@@ -6,7 +6,7 @@ import importlib.util
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 import cv2
@@ -63,26 +63,22 @@ def awaited(condition: Callable[[], bool]) -> bool:
     return condition()
 
 
-def test_every_node_starts_is_discovered_and_ends_on_sigterm(
-    tmp_path: Path, listener: Node
-) -> None:
-    for side in SIDES:
-        (tmp_path / side).mkdir()
-        cv2.imwrite(str(tmp_path / side / "1.png"), np.zeros((768, 1024), np.uint8))
+def run_until_sigterm(names: Collection[str], folder: Path, listener: Node) -> None:
+    """Start nodes, end them once the listener has discovered all, and check how they ended."""
     nodes = [
         NodeProcess(
             name,
-            [find_executable(package, name), *words(name, tmp_path)],
+            [find_executable(package, name), *words(name, folder)],
             environment=os.environ,
-            log=tmp_path / f"{name}.log",
+            log=folder / f"{name}.log",
         )
         for package, name, _ in executables("node")
-        if importlib.util.find_spec(EXTRAS.get(name, "rclpy"))
+        if name in names and importlib.util.find_spec(EXTRAS.get(name, "rclpy"))
     ]
-    names = {node.name for node in nodes}
+    started = {node.name for node in nodes}
     try:
-        awaited(lambda: names <= set(listener.get_node_names()))
-        assert names - set(listener.get_node_names()) == set()
+        awaited(lambda: started <= set(listener.get_node_names()))
+        assert started - set(listener.get_node_names()) == set()
         for node in nodes:
             node.signal_group(signal.SIGTERM)
         assert wait_for(nodes, PATIENCE) == []
@@ -91,3 +87,15 @@ def test_every_node_starts_is_discovered_and_ends_on_sigterm(
     for node in nodes:
         assert node.exit_code in (EXIT_DONE, EXIT_INTERRUPTED), node.describe_end()
         assert "Traceback" not in "".join(node.tail(1000))
+
+
+def test_every_node_starts_is_discovered_and_ends_on_sigterm(
+    tmp_path: Path, listener: Node
+) -> None:
+    for side in SIDES:
+        (tmp_path / side).mkdir()
+        cv2.imwrite(str(tmp_path / side / "1.png"), np.zeros((768, 1024), np.uint8))
+    names = {name for _, name, _ in executables("node")}
+    # The player ends as soon as a rig starts beside it.
+    run_until_sigterm({"player"}, tmp_path, listener)
+    run_until_sigterm(names - {"player"}, tmp_path, listener)
