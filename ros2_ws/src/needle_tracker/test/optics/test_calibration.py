@@ -140,19 +140,6 @@ def test_bad_windows_are_named(own_windows: Any) -> None:
         with pytest.raises(UserError, match=named) as caught:
             parse_calibration(content)
         assert "\n" not in str(caught.value)
-
-
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    for data, says in (
-        (None, "No such file"),
-        (b"\xff\xfe\x80\x81", "not a text file"),
-        (b"", "phantom"),
-        (b"[1, 2]", "rig.yaml"),
-        (b"{a: [", "YAML"),
-        (b"phantom: 3", "phantom"),
-    ):
-        if data is not None:
-            path.write_bytes(data)
-        with pytest.raises(UserError, match=says):
-            load_calibration(path)
+    for other in ([1, 2], {"phantom": 3}):
+        with pytest.raises(UserError, match="phantom"):
+            parse_calibration(other)
