@@ -85,7 +85,7 @@ def test_simulation_and_tracker_project_alike(calibration_path: Path, tmp_path: 
     windows = calibration_path.with_name("calibration_top_and_side.yaml").read_text()
     layered = windows.replace("layers: [", "layers: [{thickness: 0.003, refractive_index: 1.1}, ")
     # In the gel, in the layers, and before them.
-    points = np.random.default_rng(0).uniform([-0.03, -0.03, 0.0], [0.04, 0.05, 0.14], (2000, 3))
+    points = np.random.default_rng(0).uniform([-0.2, -0.2, -0.2], [0.04, 0.05, 0.3], (2000, 3))
     path = tmp_path / "rig.yaml"
     for text in (calibration_path.read_text(), windows, layered):
         path.write_text(text)
