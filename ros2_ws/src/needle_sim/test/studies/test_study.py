@@ -207,7 +207,7 @@ def test_a_bump_moves_the_needle_once_at_half_the_depth_and_not_the_plane() -> N
 
 def test_tips_with_a_hidden_delay_appear_to_be_new() -> None:
     prompt, _ = watched(STARTS[:3], depth=0.010)
-    both, _ = watched(STARTS[:3], depth=0.010, disturbances=Disturbances(delay=2, untold_delay=1))
+    both, _ = watched(STARTS[:3], depth=0.010, disturbances=Disturbances(delay=2, hidden_delay=1))
     assert np.all(np.isnan(both.tips[:3]))
     np.testing.assert_array_equal(both.tips[3:], prompt.tips[:-3])
     np.testing.assert_allclose(both.ages, [0.0] * 2 + [0.002] * 8)
