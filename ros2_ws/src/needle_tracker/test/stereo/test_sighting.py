@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import drawn_needles
 from needle_tracker.detector.end_fit import ImageEnd
 from needle_tracker.detector.end_search import ShaftPath
 from needle_tracker.optics.refraction import RefractedCamera
@@ -21,7 +22,7 @@ from needle_tracker.stereo.triangulation import triangulate
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Views = tuple[RefractedCamera, RefractedCamera]
-MakeArc = Callable[..., np.ndarray]
+Search = Callable[..., StereoSearch]
 
 
 @dataclasses.dataclass
@@ -43,7 +44,7 @@ class SeenLines:
 
 
 @pytest.fixture
-def search(views: Views, settings: StereoTrackerParameters) -> Callable[..., StereoSearch]:
+def search(views: Views, settings: StereoTrackerParameters) -> Search:
     def make(left: list[np.ndarray], right: list[np.ndarray]) -> StereoSearch:
         detectors = SeenLines(views[0], left), SeenLines(views[1], right)
         return StereoSearch(views, detectors, settings)  # type: ignore[arg-type]
@@ -52,13 +53,11 @@ def search(views: Views, settings: StereoTrackerParameters) -> Callable[..., Ste
 
 
 @pytest.fixture
-def needle(make_arc: MakeArc) -> np.ndarray:
-    return np.asarray(make_arc(0.06, 6.0, 0.7))
+def needle() -> np.ndarray:
+    return drawn_needles.arc(0.06, 6.0, 0.7)
 
 
-def test_the_end_in_only_one_view_is_reported(
-    search: Callable[..., StereoSearch], needle: np.ndarray
-) -> None:
+def test_the_end_in_only_one_view_is_reported(search: Search, needle: np.ndarray) -> None:
     sightings, (left, right) = search([needle], []).search(3e-3, 0.15)
     assert sightings == []
     assert left is not None
@@ -66,41 +65,33 @@ def test_the_end_in_only_one_view_is_reported(
     assert right is None
 
 
-def test_one_needle_in_both_views_is_one_sighting(
-    search: Callable[..., StereoSearch], needle: np.ndarray
-) -> None:
+def test_one_needle_in_both_views_is_one_sighting(search: Search, needle: np.ndarray) -> None:
     (sighting,) = search([needle], [needle]).search(3e-3, 0.15)[0]
     np.testing.assert_allclose(sighting.tip.position, needle[-1], atol=0.05e-3)
     assert sighting.length == pytest.approx(0.06, abs=0.2e-3)
     assert sighting.evidence > 4.0
 
 
-def test_a_line_in_only_one_view_is_no_sighting(
-    search: Callable[..., StereoSearch], needle: np.ndarray, make_arc: MakeArc
-) -> None:
-    line = make_arc(0.09, 3.0, -1.5)
+def test_a_line_in_only_one_view_is_no_sighting(search: Search, needle: np.ndarray) -> None:
+    line = drawn_needles.arc(0.09, 3.0, -1.5)
     found = search([line, needle], [needle]).search(3e-3, 0.15)[0]
     assert len(found) == 1
     np.testing.assert_allclose(found[0].tip.position, needle[-1], atol=0.05e-3)
 
 
-def test_a_shadow_on_the_floor_is_no_sighting(
-    search: Callable[..., StereoSearch], needle: np.ndarray
-) -> None:
+def test_a_shadow_on_the_floor_is_no_sighting(search: Search, needle: np.ndarray) -> None:
     shadow = needle * [0.0, 1.0, 1.0] - [0.02, 0.0, 0.0]
     assert search([shadow], [shadow]).search(3e-3, 0.15)[0] == []
 
 
 def test_a_line_whose_tangent_misses_the_entry_is_no_sighting(
-    search: Callable[..., StereoSearch], needle: np.ndarray
+    search: Search, needle: np.ndarray
 ) -> None:
     beside = needle + np.array([0.0, 0.017, 0.0])
     assert search([beside], [beside]).search(3e-3, 0.15)[0] == []
 
 
-def test_sightings_are_only_at_the_given_distances(
-    search: Callable[..., StereoSearch], needle: np.ndarray
-) -> None:
+def test_sightings_are_only_at_the_given_distances(search: Search, needle: np.ndarray) -> None:
     assert search([needle], [needle]).search(0.07, 0.08)[0] == []
 
 
