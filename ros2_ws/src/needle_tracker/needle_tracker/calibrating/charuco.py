@@ -177,7 +177,18 @@ def write_board(board: CharucoBoard, path: Path) -> None:
         ha="center",
         fontsize=6,
     )
+    save_figure(figure, path, _PRINT_DPI)
+
+
+def save_figure(figure: Figure, path: Path, dpi: int) -> None:
+    """Write a figure as PNG or PDF.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
     try:
-        figure.savefig(path, dpi=_PRINT_DPI)
+        figure.savefig(path, dpi=dpi)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error

@@ -95,19 +95,17 @@ class RigCalibration:
     tip_error_p95: float
     apart: list[BoardView]
 
-    def reprojection_rms_px(self, side: str, views: npt.ArrayLike | None = None) -> float:
-        """Return the reprojection error of a camera, over all views or some [px].
+    def reprojection_rms_px(self, side: str, views: npt.ArrayLike) -> float:
+        """Return the reprojection error of a camera over some views [px].
 
         Parameters
         ----------
         side : str
             "left" or "right".
-        views : int or array_like of int, optional
+        views : int or array_like of int
             Numbers of the views.
         """
-        errors = self.residuals(side)
-        if views is not None:
-            errors = errors[np.isin(self.model.view_of[side], views)]
+        errors = self.residuals(side)[np.isin(self.model.view_of[side], views)]
         return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else np.nan
 
     def residuals(self, side: str) -> Array:

@@ -109,8 +109,8 @@ class RigModel:
         self.names += own if self._surface is None else SURFACE
         self.shared = len(self.names)
         self._boards = np.asarray(boards, dtype=np.float64).reshape(-1, 4, 4)
-        self._points = {s: _join([v.corners(s).points for v in views], 3) for s in SIDES}
-        self.pixels = {s: _join([v.corners(s).pixels for v in views], 2) for s in SIDES}
+        self._points = {s: np.concatenate([v.corners(s).points for v in views]) for s in SIDES}
+        self.pixels = {s: np.concatenate([v.corners(s).pixels for v in views]) for s in SIDES}
         self.view_of = {
             s: np.repeat(np.arange(len(views)), [len(v.corners(s).points) for v in views])
             for s in SIDES
@@ -222,10 +222,6 @@ class RigModel:
         return dataclasses.replace(
             window, point=window.point + offset * window.normal, normal=turned
         )
-
-
-def _join(arrays: list[Array], width: int) -> Array:
-    return np.concatenate([np.zeros((0, width)), *arrays])
 
 
 def needle_points(calibration: StereoCalibration) -> Array:
