@@ -64,11 +64,11 @@ class CharucoBoard:
         number = getattr(cv2.aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(number, int):
             raise UserError(f"board.dictionary = {self.dictionary!r} is not one of OpenCV's")
-        wanted = self.columns * self.rows // 2
+        needed = self.columns * self.rows // 2
         markers = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
-        if markers < wanted:
+        if markers < needed:
             raise UserError(
-                f"board of {self.columns} x {self.rows} squares needs {wanted} markers, "
+                f"board of {self.columns} x {self.rows} squares needs {needed} markers, "
                 f"{self.dictionary} has {markers}"
             )
 

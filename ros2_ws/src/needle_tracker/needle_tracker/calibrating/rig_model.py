@@ -144,8 +144,8 @@ class RigModel:
 
     def residuals(self, parameters: Array) -> Array:
         """Return measured minus expected pixels, left then right, shape (2 * corners,) [px]."""
-        seen = [(self.pixels[s] - self.project(parameters, s)).ravel() for s in SIDES]
-        return np.concatenate(seen)
+        sides = [(self.pixels[s] - self.project(parameters, s)).ravel() for s in SIDES]
+        return np.concatenate(sides)
 
     def project(self, parameters: Array, side: str) -> Array:
         """Return the expected pixels of the corners of one camera, shape (n, 2) [px]."""
@@ -153,10 +153,10 @@ class RigModel:
         boards, transform = self.board_poses(parameters)[self.view_of[side]], camera.T_optical_rig
         corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side])
         corners += boards[:, :3, 3]
-        seen = corners @ transform[:3, :3].T + transform[:3, 3]
+        optical = corners @ transform[:3, :3].T + transform[:3, 3]
         if np.any(under):
-            seen[under] = RefractedCamera(camera).seen_through(corners[under])
-        return project_optical(camera, seen)
+            optical[under] = RefractedCamera(camera).apparent_points(corners[under])
+        return project_optical(camera, optical)
 
     def jacobian(self, parameters: Array, free: Mask) -> Array:
         """Return d(residuals)/d(free parameters), shape (2 * corners, free).
