@@ -78,6 +78,11 @@ BAD_POINTS: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
         lambda r, t: (r, t + np.outer(np.eye(6)[4], [0.0, 0.0, 5e-3])),
         "E does not fit the others",
     ),
+    # Three points leave no error at a point left out.
+    "one of three off": (
+        lambda r, t: (r[:3], t[:3] + np.outer(np.eye(3)[2], [0.0, 0.0, 8e-3])),
+        "fiducial error",
+    ),
     "far away": (
         only((0, 0, -3000), (0, 20, -3000), (20, 0, -3020)),
         "standard deviation at the entry point",
