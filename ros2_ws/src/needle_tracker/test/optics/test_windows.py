@@ -1,12 +1,17 @@
 """Refraction at windows of any position, direction and number of layers, against its laws.
 
-Oracles: Fermat's principle, Snell's law, OpenCV's projection.
+Oracles: the package aquacal, Fermat's principle, Snell's law, OpenCV's projection.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import importlib.util
+import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,10 +39,10 @@ from needle_tracker.tracker_parameters import StereoTrackerParameters
 Array = np.ndarray
 
 
-def random_view(seed: int, layers: int) -> tuple[RefractedCamera, Array]:
+def random_view(seed: int, layers: int, turn: Array | None = None) -> tuple[RefractedCamera, Array]:
     """Return a camera up to 40 deg oblique to a window of some layers, and points behind it."""
     rng = np.random.default_rng(seed)
-    turn = Rotation.random(rng=rng).as_matrix()
+    turn = Rotation.random(rng=rng).as_matrix() if turn is None else turn
     walls = tuple(Layer(*rng.uniform([1e-3, 1.0], [0.02, 1.8]).tolist()) for _ in range(layers))
     window = Window(rng.uniform(-0.1, 0.1, 3), turn[:, 0], walls, float(rng.uniform(1.2, 1.6)))
     distance, tilt = rng.uniform(0.1, 1.0), rng.uniform(0.0, 0.7)
@@ -82,6 +87,52 @@ def compiled_rays(view: RefractedCamera, pixels: Array) -> tuple[Array, Array]:
     for pixel, origin, direction in zip(rows, origins, directions, strict=True):
         pixel_ray(view.packed, pixel, origin, direction)
     return origins, directions
+
+
+@pytest.fixture(scope="module")
+def aquacal() -> Any:
+    """Geometry of aquacal alone: `import aquacal` would need all that its calibration needs."""
+    spec = importlib.util.find_spec("aquacal")
+    assert spec is not None, "aquacal is not installed: scripts/setup"
+    assert spec.submodule_search_locations is not None
+    package = ModuleType("aquacal")
+    package.__path__ = list(spec.submodule_search_locations)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "aquacal", package)
+        yield importlib.import_module("aquacal.core")
+        for name in [name for name in sys.modules if name.startswith("aquacal.")]:
+            patch.delitem(sys.modules, name)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pixels_and_rays_agree_with_aquacal(aquacal: Any, seed: int) -> None:
+    # The world of aquacal has z down into the water: x = rig y, y = -rig z, z = -rig x.
+    turn = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    view, points = random_view(seed, 0, np.eye(3))
+    schema = importlib.import_module("aquacal.config.schema")
+    # aquacal undistorts by few iterations of OpenCV, so rays are compared with a perfect lens.
+    for distortion in (view.camera.distortion, np.zeros(5)):
+        camera = dataclasses.replace(view.camera, distortion=distortion)
+        view, pose = RefractedCamera(camera), camera.T_optical_rig
+        intrinsics = schema.CameraIntrinsics(camera.camera_matrix, distortion, (1024, 768))
+        extrinsics = schema.CameraExtrinsics(pose[:3, :3] @ turn.T, pose[:3, 3])
+        surface = aquacal.Interface(
+            normal=np.array([0.0, 0.0, -1.0]),
+            camera_distances={"camera": -camera.window.point[0]},
+            n_air=1.0,
+            n_water=camera.window.inside,
+        )
+        other = aquacal.Camera("camera", intrinsics, extrinsics)
+        pixels = np.array(
+            [
+                aquacal.refractive_project(other, surface, p, max_iterations=50, tolerance=1e-15)
+                for p in points @ turn.T
+            ]
+        )
+        np.testing.assert_allclose(view.project(points), pixels, rtol=0.0, atol=1e-8)
+    rays = np.array([aquacal.refractive_back_project(other, surface, p) for p in pixels]) @ turn
+    np.testing.assert_allclose(compiled_rays(view, pixels)[0], rays[:, 0], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(compiled_rays(view, pixels)[1], rays[:, 1], rtol=0.0, atol=1e-12)
 
 
 @VIEWS
