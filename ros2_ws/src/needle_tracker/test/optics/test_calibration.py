@@ -117,9 +117,6 @@ def no_window(content: Any) -> None:
         del content[side]["window"]
 
 
-LAYER = ("right", "window", "layers", 0, "thickness")
-
-
 def test_bad_windows_are_named(own_windows: Any) -> None:
     for spoil, named in (
         (put("phantom", {"surface_height": 0.01, "refractive_index": 1.3}), "take phantom out"),
@@ -130,8 +127,7 @@ def test_bad_windows_are_named(own_windows: Any) -> None:
         (put("left", "window", "normal", [-1.0, 0.0, 0.0]), "normal must point to the camera"),
         (put("left", "window", "layers", None), "layers = None is not a list"),
         (put("left", "window", "layers", [{"thickness": 0.005}]), "layers.0..refractive_index"),
-        (put(*LAYER, -1e-3), "layers.0..thickness"),
-        (put(*LAYER, 5), "right.window.layers.0..thickness"),
+        (put("right", "window", "layers", 0, "thickness", -1e-3), "layers.0..thickness"),
         (put("right", "window", "inside", 0.9), "right.window.inside"),
         (put("right", "window", "point", [0.0, 0.06]), "right.window.point needs 3 numbers"),
     ):
