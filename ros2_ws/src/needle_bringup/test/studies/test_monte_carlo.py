@@ -137,7 +137,7 @@ def test_disturbances_are_in_si_and_independent_of_the_claim() -> None:
     assert found.noise == pytest.approx(0.00058)
     assert found.noise_shape == "normal"
     assert found.outlier_size == pytest.approx((0.002, 0.0035))
-    assert (found.slip, found.bump, found.untold_delay) == (-0.05, 0.002, 3)
+    assert (found.slip, found.bump, found.hidden_delay) == (-0.05, 0.002, 3)
     assert (options.claimed_bound, options.sigma_scale) == (0.001, 2.0)
     assert parse(["--claimed-mm", "0.5"]).claimed_bound == 0.0005
     walking = "--push 2 --rotation-gain 0.8 --roll-walk 5 --layer 0.3,60 --bias-walk 0.3"

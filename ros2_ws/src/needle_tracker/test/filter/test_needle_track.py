@@ -33,7 +33,7 @@ def after(
     for place, insertion in zip(places[1:], insertions[1:], strict=True):
         track = track.predicted(insertion, settings)
         if track.fits(sighting(place).tip, settings):
-            track = track.seen(sighting(place), settings)
+            track = track.updated(sighting(place), settings)
         else:
             track = track.missed()
     return track
@@ -88,5 +88,5 @@ def test_after_a_gap_the_needle_must_move_again(settings: StereoTrackerParameter
     track = before = after(settings, insertions, list(insertions))
     for n in range(20):
         track = track.predicted(insertions[-1] + 1e-3 * n, settings).missed()
-    again = track.seen(sighting(insertions[-1] + 19e-3), settings)
+    again = track.updated(sighting(insertions[-1] + 19e-3), settings)
     assert again.motion_log_odds < before.motion_log_odds
