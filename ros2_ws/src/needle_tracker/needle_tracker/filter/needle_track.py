@@ -162,14 +162,19 @@ class NeedleTrack:
         State if it is the needle.
     rest_position, rest_covariance : ndarray, shape (3,) and (3, 3)
         Position if it stands still [m], and its covariance [m^2].
-    end_log_odds : float
-        Log-odds that it is an end.
+    recent_evidence : float
+        Mean log-odds that it is an end, from the sightings of about the last
+        `FilterSettings.evidence_length`.
+    earlier_evidence : float
+        Log-odds that it is an end, from earlier sightings.
     length_log_odds : float
-        Log-odds that the needle ends here, from the insertion and the length of the shaft.
+        Mean log-odds that the needle ends here, from the insertion and the length of the shaft.
     motion_log_odds : float
         Log-odds that it moves like the needle rather than standing still.
     insertion : float or None
         Insertion of the last pair [m].
+    sightings : int
+        Number of sightings.
     travel : float or None
         Travel of the stage since the last sighting [m]; None if the insertion is unknown.
     travel_sigma : float
@@ -181,10 +186,12 @@ class NeedleTrack:
     motion: NeedleMotion
     rest_position: Array
     rest_covariance: Array
-    end_log_odds: float
+    recent_evidence: float
+    earlier_evidence: float
     length_log_odds: float
     motion_log_odds: float
     insertion: float | None
+    sightings: int = 1
     travel: float | None = 0.0
     travel_sigma: float = 0.0
     misses: int = 0
@@ -198,11 +205,10 @@ class NeedleTrack:
         motion = NeedleMotion.begin(tip, settings)
         if insertion is not None and sighting.length is not None:
             motion = motion.corrected_by_length(sighting.length, insertion, FILTER.length_sigma)
-        end = FILTER.prior_log_odds + sighting.evidence
-        length = length_log_odds(sighting, insertion, settings)
+        length = length_log_odds(sighting.length, insertion, settings)
         return NeedleTrack(
-            motion, tip.position, tip.covariance, end, length, 0.0, insertion
-        )._bounded()
+            motion, tip.position, tip.covariance, sighting.evidence, 0.0, length, 0.0, insertion
+        )
 
     def predicted(self, insertion: float | None, settings: StereoTrackerParameters) -> NeedleTrack:
         """Return the track at the next pair, before any sighting in it."""
@@ -246,6 +252,11 @@ class NeedleTrack:
         if travel is None:
             travel = math.dist(tip.position, self.rest_position)
         independent = min(abs(travel) / FILTER.evidence_length, 1.0)
+        # Images of nearly the same needle are repeated readings of one evidence: their mean counts.
+        weight = max(1.0 / (self.sightings + 1), independent)
+        length = self.length_log_odds
+        if sighting.length is not None:
+            length = length_log_odds(sighting.length, self.insertion, settings)
         # The end after a gap may be that of another object, such as the shadow of the needle.
         before = self.motion_log_odds
         before = max(before - FILTER.miss_cost * self.misses, min(before, 0.0))
@@ -254,15 +265,14 @@ class NeedleTrack:
             motion=motion.corrected_by_tip(tip),
             rest_position=rest_position,
             rest_covariance=rest_covariance,
-            end_log_odds=self.end_log_odds + independent * sighting.evidence,
-            # An object that ended where the needle cannot end is not the needle.
-            length_log_odds=min(
-                self.length_log_odds, length_log_odds(sighting, self.insertion, settings)
-            ),
-            motion_log_odds=before + gain,
+            recent_evidence=(1.0 - weight) * self.recent_evidence + weight * sighting.evidence,
+            earlier_evidence=_bounded(self.earlier_evidence + independent * self.recent_evidence),
+            length_log_odds=(1.0 - weight) * self.length_log_odds + weight * length,
+            motion_log_odds=_bounded(before + gain),
+            sightings=self.sightings + 1,
             travel=0.0,
             misses=0,
-        )._bounded()
+        )
 
     def _surprise_at_rest(self, tip: SpatialTip) -> tuple[float, float]:
         """Return squared distance and log-density of a sighting if this stands still."""
@@ -309,7 +319,8 @@ class NeedleTrack:
 
         P(else) / P(needle) = (e^-motion + e^-end [e^-motion] + e^-shadow) e^-length
         """
-        no_end = -self.end_log_odds
+        evidence = self.recent_evidence + self.earlier_evidence
+        no_end = -_bounded(FILTER.prior_log_odds + evidence)
         if self.insertion is None:
             no_end -= self.motion_log_odds
         others = _log_sum(-self.motion_log_odds, no_end)
@@ -318,15 +329,6 @@ class NeedleTrack:
     def rank(self) -> float:
         """Return the log-odds for comparison with other tracks, reduced by each miss."""
         return self.log_odds() - FILTER.miss_cost * self.misses
-
-    def _bounded(self) -> NeedleTrack:
-        """Return the track with bounded log-odds."""
-        bound = FILTER.max_log_odds
-        return dataclasses.replace(
-            self,
-            end_log_odds=min(max(self.end_log_odds, -bound), bound),
-            motion_log_odds=min(max(self.motion_log_odds, -bound), bound),
-        )
 
     @property
     def tip(self) -> tuple[Array, Array]:
@@ -340,25 +342,23 @@ class NeedleTrack:
 
 
 def length_log_odds(
-    sighting: Sighting, insertion: float | None, settings: StereoTrackerParameters
+    length: float | None, insertion: float | None, settings: StereoTrackerParameters
 ) -> float:
-    """Return the log-odds that an end is that of the needle, from the length of its shaft.
+    """Return the log-odds that an end is that of the needle, from the length of its shaft [m].
 
-    The needle is as long as the insertion, while other objects end at any distance. An end that was
-    found by following the stage is no further evidence: infinite. Without the insertion, all
-    lengths are equally likely.
+    The needle is as long as the insertion, while other objects end at any distance. If one of the
+    two is unknown, all lengths are equally likely.
     """
-    if insertion is None:
+    if insertion is None or length is None:
         return 0.0
-    if sighting.length is None:
-        return math.inf
     sigma = math.hypot(
         settings.stage_zero_sigma,
         settings.stage_scale_sigma * insertion,
         FILTER.length_sigma,
     )
-    off = (sighting.length - insertion) / sigma
-    return math.log(settings.max_insertion / (math.sqrt(2.0 * math.pi) * sigma)) - 0.5 * off * off
+    off = (length - insertion) / sigma
+    agreeing = math.log(settings.max_insertion / (math.sqrt(2.0 * math.pi) * sigma))
+    return _bounded(agreeing - 0.5 * off * off)
 
 
 def _merged(position: Array, covariance: Array, tip: SpatialTip) -> tuple[Array, Array]:
@@ -369,6 +369,10 @@ def _merged(position: Array, covariance: Array, tip: SpatialTip) -> tuple[Array,
         return tip.position, tip.covariance
     gain = np.linalg.solve(total, covariance).T
     return position + gain @ off, covariance - gain @ covariance
+
+
+def _bounded(log_odds: float) -> float:
+    return min(max(log_odds, -FILTER.max_log_odds), FILTER.max_log_odds)
 
 
 def _log_sum(one: float, other: float) -> float:
