@@ -90,6 +90,8 @@ def test_an_age_is_not_a_slip() -> None:
     assert hidden_age(inserted, ways, 0.0, *KNOWN) == pytest.approx(0.003, abs=1e-4)
     inserted, ways = seen(0.0, 0.2)
     assert hidden_age(inserted, ways, 0.0, *KNOWN) == 0.0
+    # If the insertion scale is known to be 1, the missing insertion is an age.
+    assert hidden_age(inserted, ways, 0.0, *KNOWN[:2], 0.0) > 0.0
 
 
 def test_a_first_tip_that_was_too_deep_is_not_an_age() -> None:
@@ -106,10 +108,3 @@ def test_no_age_is_detected_without_a_start_or_tips() -> None:
     np.testing.assert_array_equal(np.array(ages) > 0.0, [True, False, True])
     few[np.argmax(inserted >= FIRST)] = np.nan
     assert hidden_age(inserted, few, 0.0, *KNOWN) == 0.0
-
-
-def test_a_known_insertion_scale_leaves_no_slip() -> None:
-    inserted, ways = seen(0.0, 0.2)
-    assert hidden_age(inserted, ways, 0.0, *KNOWN) == 0.0
-    # Without slip, the missing insertion is an age.
-    assert hidden_age(inserted, ways, 0.0, *KNOWN[:2], 0.0) > 0.0

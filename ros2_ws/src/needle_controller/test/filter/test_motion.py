@@ -114,18 +114,6 @@ def test_the_covariance_follows_the_steps_derivative(
     np.testing.assert_array_equal(found, found.T)
 
 
-def test_torsion_angles_are_updated() -> None:
-    for play, lag in TORSIONS:
-        before = hypothesis(play, lag)
-        after = moved(before, 0.001, 0.5)
-        assert after["behind_play"] == pytest.approx(0.5 * before["gain"] - play)
-        if lag:
-            assert 0.0 < after["tip_angle"] < after["behind_play"]
-        else:
-            assert after["tip_angle"] == after["behind_play"]
-            assert after["dtip_dtorsion"] == (-1.0 if play else 0.5)
-
-
 @pytest.mark.parametrize(("play", "lag"), [(0.1, 0.0), (0.0, 0.004), (0.0, 0.0)])
 def test_process_noise_is_added_where_it_belongs(play: float, lag: float) -> None:
     settings = FilterSettings(

@@ -7,7 +7,6 @@ import math
 
 import pytest
 
-from needle_controller.model.target_plane import offset_plane
 from needle_controller.planning import entry
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -118,21 +117,6 @@ def test_a_needle_that_is_out_restarts_the_estimate() -> None:
     assert rig.steering.step == 0
     assert not rig.steering.control.started
     assert rig.steering.tips.last is None
-
-
-def test_settings_change_while_steering() -> None:
-    steering = Steering(SETTINGS)
-    law = steering.control._law
-    steering.control.plane = offset_plane(0.005)
-    shallower = dataclasses.replace(SETTINGS, depth=0.1, tip_timeout=3.0)
-    steering.configure(shallower)
-    assert steering.settings is shallower
-    # A received plane stays unless the offset changes.
-    assert steering.control.plane.offset == 0.005
-    steering.configure(dataclasses.replace(shallower, target_offset=0.002, preset="open_loop"))
-    assert steering.control.plane.offset == 0.002
-    assert steering.control._settings.preset == "open_loop"
-    assert steering.control._law is not law
 
 
 def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.MonkeyPatch) -> None:
