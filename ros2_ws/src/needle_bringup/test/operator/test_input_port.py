@@ -19,7 +19,7 @@ from needle_bringup.operator.hold_debouncer import (
     InputReading,
     InputState,
 )
-from needle_bringup.operator.input_device import InputDevice, KeyChanges, key_changes, set_bits
+from needle_bringup.operator.input_device import InputDevice, set_bits
 from needle_bringup.operator.input_port import OPEN_PERIOD, InputPort
 from needle_bringup.operator.parameters import OperatorParameters
 
@@ -190,11 +190,6 @@ def test_an_axis_sets_the_speed_up_to_the_scale() -> None:
         read = desk.read()
         assert isinstance(read, InputState)
         assert read.speed == pytest.approx(0.8 * share)
-
-
-def test_key_repeat_is_no_change() -> None:
-    data = key(KEY, DOWN) + key(RETRACT, REPEAT) + key(KEY, UP) + key(STOP, DOWN)
-    assert key_changes(data) == KeyChanges(frozenset({KEY, STOP}), frozenset({KEY}))
 
 
 def test_a_file_that_is_no_input_device_is_rejected() -> None:

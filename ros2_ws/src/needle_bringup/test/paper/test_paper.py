@@ -107,11 +107,9 @@ def test_bad_arguments_give_a_one_line_error_and_exit_2(
 ) -> None:
     (tmp_path / "file").write_text("", "utf-8")
     for words, said in (
-        (["--seed", "x"], "'x'"),
         (["--seed", "-1"], "--seed"),
         (["--json", "/nowhere/f.json"], "/nowhere/f.json"),
         (["--out", str(tmp_path / "file")], "--out"),
-        (["--frobnicate"], "--frobnicate"),
     ):
         assert main(words) == 2
         captured = capsys.readouterr()

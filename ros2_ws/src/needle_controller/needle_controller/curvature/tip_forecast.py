@@ -47,9 +47,9 @@ class TipForecast:
     tip: Array
     covariance: Array
 
-    def interval(self, deviations: float = 1.96) -> Array:
-        """Return the half-width of each coordinate's interval, (3,) [m], by default for 95 %."""
-        return np.asarray(deviations * np.sqrt(np.diagonal(self.covariance)))
+    def interval(self) -> Array:
+        """Return the half-width of each coordinate's 95 % interval, (3,) [m]."""
+        return np.asarray(1.96 * np.sqrt(np.diagonal(self.covariance)))
 
 
 def forecast_tip(
