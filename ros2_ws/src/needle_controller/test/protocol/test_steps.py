@@ -55,19 +55,6 @@ def test_a_tip_leads_to_one_step_and_its_end_awaits_another() -> None:
     assert rig.steering.insertion == pytest.approx(0.001)
 
 
-def test_a_tip_waits_for_its_joints() -> None:
-    rig = Rig()
-    rig.now += TICK
-    assert rig.steering.on_tip(rig.measured()) == []
-    assert where(rig) == (STEERING, Awaiting.TIP)
-    rig.run(sent(rig.joints()))
-    # Joints interpolated at the exposure, between two samples.
-    rig.now += TICK
-    tip = TipMeasurement(rig.now - TICK // 2, "rig", np.array([0.0, 0.0, 0.001]))
-    assert rig.steering.on_tip(tip) == []
-    assert sent(rig.joints()).stamp_ns == tip.stamp_ns
-
-
 def test_without_hold_no_tip_is_used_and_after_it_a_fresh_one() -> None:
     rig = Rig(held=False)
     for _ in range(2):
