@@ -31,7 +31,7 @@ class Bench:
     def __init__(self, settings: SteeringSettings = SETTINGS, receiver: str = "/device") -> None:
         self.component = PlaneController(settings)
         self.now, self.later = TICK, 0.0
-        self.place = {"rotation": 0.0, "insertion": 0.0}
+        self.position = {"rotation": 0.0, "insertion": 0.0}
         self.published: defaultdict[str, list[Any]] = defaultdict(list)
         self.health: dict[str, Diagnostic] = {}
         self.logs: list[str] = []
@@ -75,15 +75,15 @@ class Bench:
         self.receive("joint_states", m.JointState(self.now, names, tuple(positions.values())))
 
     def tip(self, x: float = 0.0, frame: str = "rig") -> None:
-        self.joints(**self.place)
-        z = self.place["insertion"]
+        self.joints(**self.position)
+        z = self.position["insertion"]
         self.receive("needle/tip", m.Point(self.now, frame, (x, 0.0, z)))
 
     def started(self) -> Bench:
         self.receive(
             "device/status", DeviceStatus(state="HOLDING", homed=True, hold_owner="operator")
         )
-        self.joints(**self.place)
+        self.joints(**self.position)
         assert self.call("start") == (True, "steering")
         return self
 
@@ -95,8 +95,8 @@ class Bench:
         command: m.Trajectory = self.published[COMMANDS][-1]
         assert command.stamp_ns == self.now
         insertion, rotation = command.points[0].positions
-        self.place = {"rotation": rotation, "insertion": insertion}
-        self.joints(**self.place)
+        self.position = {"rotation": rotation, "insertion": insertion}
+        self.joints(**self.position)
         self.receive("device/result", m.CommandResult(command.stamp_ns, "succeeded"))
         return command
 

@@ -72,7 +72,7 @@ def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], Timed
         targets = np.broadcast_to(motion.last, (len(known), 3))
         rates, left = np.empty(len(known)), np.empty(len(known))
         for n, (own, law) in enumerate(laws):
-            own.see(motion.seen, targets[n])
+            own.observe(motion.last_time, targets[n])
             inserted = float(insertion[n])
             command = law(known[n], inserted / INSERTION_SPEED, inserted, float(rotation_left[n]))
             assert command.insertion_left is not None

@@ -155,7 +155,7 @@ def test_a_planned_path_is_followed_and_without_one_the_needle_stops() -> None:
     )
     needle.reset(np.zeros(3), np.zeros(2))
     for target, has_a_way in (([0.004, 0.0, 0.08], True), ([0.05, 0.0, 0.02], False)):
-        motion.see(motion.seen + 1.0 if target[0] > 0.01 else 0.0, np.array(target))
+        motion.observe(motion.last_time + 1.0 if target[0] > 0.01 else 0.0, np.array(target))
         command = planned_law(motion, settings)(needle.estimate(), 0.0, 0.0, math.inf)
         assert command.insertion_left is not None
         assert (command.insertion_left > 0.079) is has_a_way

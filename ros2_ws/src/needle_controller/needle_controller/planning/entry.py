@@ -60,12 +60,12 @@ def first_path(
     if path is not None:
         return path
     clear = planner.settings.least_clearance
-    for name, point, wanted in (
+    for name, point, minimum in (
         ("target point", target, clear - planner.settings.goal_tolerance),
         ("entry", entry.position, clear),
     ):
-        if (distance := obstacles.clearance(point)) < wanted:
-            return f"the {name} is {distance:.4g} m from an obstacle, minimum {wanted:.4g} m"
+        if (distance := obstacles.clearance(point)) < minimum:
+            return f"the {name} is {distance:.4g} m from an obstacle, minimum {minimum:.4g} m"
     possible = planner.may_have_path(entry, target, obstacles)
     path = planner.path(entry, target, obstacles, starts=THOROUGH_STARTS) if possible else None
     if path is not None:

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.random import default_rng
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
+from made_up_run import SyntheticBag, header, message, vector
 from needle_controller.curvature.curvature_data import read_record
 from needle_controller.curvature.identify_curvature import main
 from needle_controller.model.arrays import Array
@@ -117,7 +116,7 @@ def test_a_turned_base_is_rejected_except_for_the_part_before(
 
 def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "tips.csv"
-    for text, message in (
+    for text, said in (
         ("x_m,y_m,z_m\n", "the file has no rows"),
         ("a,b\n1,2\n", "x_m is missing"),
         ("x_m,y_m,z_m\n0,0,0.01\n", "1 tips are too few"),
@@ -129,7 +128,7 @@ def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
         path.write_text(text)
         assert command(path) == 2
         error = capsys.readouterr().err
-        assert message in error
+        assert said in error
         assert error.count("\n") == 1
 
 
@@ -160,26 +159,19 @@ def test_a_straight_path_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def write_bag(path: Path, tips: Array, insertion: Array, rotation: Array) -> Path:
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types = store.types
-    time, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
-    point, stamped = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/PointStamped"]
-    joints = types["sensor_msgs/msg/JointState"]
-    names = ["insertion_joint", "rotation_joint"]
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        tip_topic = writer.add_connection("/a/needle/tip", stamped.__msgtype__, typestore=store)
-        joint_topic = writer.add_connection("/a/joint_states", joints.__msgtype__, typestore=store)
-        for i, tip in enumerate(tips):
-            for topic, kind, at in ((joint_topic, joints, 0), (tip_topic, stamped, 500)):
-                stamp = header(stamp=time(sec=1 + i, nanosec=at), frame_id="rig")
-                if kind is joints:
-                    position = np.array([insertion[i], rotation[i]])
-                    none = np.zeros(0)
-                    message = joints(stamp, names, position, none, none)
-                else:
-                    message = stamped(stamp, point(*(float(v) for v in tip)))
-                data = store.serialize_cdr(message, kind.__msgtype__)
-                writer.write(topic, (1 + i) * 10**9 + at, data)
+    written = SyntheticBag(path, "/a/")
+    none = {"velocity": np.empty(0), "effort": np.empty(0)}
+    for i, tip in enumerate(tips):
+        written.now += 10**9
+        joints = {"name": ["insertion_joint", "rotation_joint"], **none}
+        joints["position"] = np.array([insertion[i], rotation[i]])
+        at, later = header(written.now), header(written.now + 500)
+        written.put("joint_states", message("sensor_msgs/msg/JointState", header=at, **joints))
+        measured = message(
+            "geometry_msgs/msg/PointStamped", header=later, point=vector(tip, "Point")
+        )
+        written.put("needle/tip", measured)
+    written.bag.close()
     return path
 
 

@@ -11,7 +11,7 @@ from needle_controller.protocol.actions import Awaiting, SteeringState
 from needle_controller.protocol.joint_history import CONFIRMED_BY, JointSample
 from needle_controller.protocol.tip_checks import TipFault, TipMeasurement
 
-from .rig import MOVING, SECOND, TICK, Rig, logged, none_sent, sent, where
+from .rig import MOVING, SECOND, TICK, Rig, logged, none_sent, sent, state_of
 
 STEERING, IDLE = SteeringState.STEERING, SteeringState.IDLE
 
@@ -101,7 +101,7 @@ def test_after_a_joint_jump_the_needle_must_be_out_or_back() -> None:
     for back in (True, False):
         rig.insertion = 0.005
         assert "IDLE: joint_states jumped from 0.01" in logged(rig.settle(CONFIRMED_BY))
-        assert where(rig) == (IDLE, Awaiting.NOTHING)
+        assert state_of(rig) == (IDLE, Awaiting.NOTHING)
         assert "withdraw the needle" in rig.start()
         if back:
             rig.insertion = deep
@@ -127,7 +127,7 @@ def test_steering_stops_when_the_clock_goes_back_and_can_restart() -> None:
     rig.steps(5)
     rig.now -= 50 * SECOND
     assert "the clock of joint_states went -" in logged(rig.settle(CONFIRMED_BY))
-    assert where(rig) == (IDLE, Awaiting.NOTHING)
+    assert state_of(rig) == (IDLE, Awaiting.NOTHING)
     assert rig.steering.tips.last is None
     assert rig.start() == "steering"
     rig.run(rig.good_tips())

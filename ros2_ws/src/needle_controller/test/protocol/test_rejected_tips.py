@@ -12,7 +12,7 @@ from needle_controller.protocol.actions import Action, Awaiting, SteeringState
 from needle_controller.protocol.tip_checks import TipCovariance, TipFault, TipMeasurement
 from needle_core.component import Log
 
-from .rig import HELD, MOVING, SECOND, TICK, Rig, logged, none_sent, sent, spied, where
+from .rig import HOLD, MOVING, SECOND, TICK, Rig, logged, none_sent, sent, spied, state_of
 
 STEERING = SteeringState.STEERING
 
@@ -43,7 +43,7 @@ def test_a_rejected_tip_causes_no_motion_and_another_is_awaited() -> None:
         assert said in rig.steering.rejection
         assert rig.steering.reason == f"tip refused: {rig.steering.rejection}"
         assert not rig.steering.control.started
-        assert where(rig) == (STEERING, Awaiting.TIP)
+        assert state_of(rig) == (STEERING, Awaiting.TIP)
         assert rig.steering.tips.after_ns == tip.stamp_ns
         sent(rig.expose())
         assert rig.steering.rejection == ""
@@ -95,18 +95,18 @@ def test_a_tip_timeout_ends_with_a_good_tip() -> None:
     timeout = rig.steering.settings.tip_timeout
     assert rig.steering.on_time(100.0) == []
     assert rig.steering.on_time(100.0 + 0.99 * timeout) == []
-    assert where(rig) == (STEERING, Awaiting.TIP)
+    assert state_of(rig) == (STEERING, Awaiting.TIP)
     said = logged(rig.steering.on_time(100.0 + timeout))
     assert said == "WAITING_FOR_TIP: no good tip for 2 s"
-    assert where(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
+    assert state_of(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_time(100.0 + 3 * timeout) == []
     rig.expose(bad(rig, [np.nan] * 3))
-    assert where(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
+    assert state_of(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
     actions = rig.expose()
     assert "STEERING: received a good tip" in logged(actions)
     sent(actions)
-    assert where(rig) == (STEERING, Awaiting.RESULT)
+    assert state_of(rig) == (STEERING, Awaiting.RESULT)
     # Stop and start also work while it waits.
     other = Rig()
     other.expose(bad(other, [np.nan] * 3))
@@ -128,13 +128,13 @@ def test_time_does_not_run_while_a_person_pauses() -> None:
     rig = Rig(held=False)
     rig.steering.on_time(0.0)
     assert rig.steering.on_time(1e6) == []
-    rig.steering.on_device(HELD)
+    rig.steering.on_device(HOLD)
     assert rig.steering.on_time(2e6) == []
     step = sent(rig.expose())
     rig.steering.on_device(MOVING)
     assert rig.steering.on_time(3e6) == []
     rig.run(step)
-    rig.steering.on_device(HELD)
+    rig.steering.on_device(HOLD)
     assert rig.steering.on_time(4e6) == []
     assert rig.steering.state is STEERING
 

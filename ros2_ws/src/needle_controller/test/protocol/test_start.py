@@ -13,16 +13,16 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import Awaiting, SteeringState
 from needle_controller.protocol.steering import Steering
 
-from .rig import HELD, MOVING, TICK, Rig, device, logged, none_sent, sent, where
+from .rig import HOLD, MOVING, TICK, Rig, device, logged, none_sent, sent, state_of
 
 SETTINGS = SteeringSettings(target_offset=0.003, tip_covariance="configured")
-HOLDING = dataclasses.replace(HELD, insertion_m=0.0, rotation_rad=0.0)
+HOLDING = dataclasses.replace(HOLD, insertion_m=0.0, rotation_rad=0.0)
 
 
 def test_start_reports_the_missing_device_state() -> None:
     bare = Steering(SETTINGS)
     assert "no device/status received" in bare.on_start()[0].message
-    bare.on_device(HELD)
+    bare.on_device(HOLD)
     assert bare.on_start()[0].message == "no joint_states received"
     rig = Rig(started=False)
     for status, said in (
@@ -34,7 +34,7 @@ def test_start_reports_the_missing_device_state() -> None:
     ):
         rig.steering.on_device(status)
         assert said in rig.start()
-        assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
+        assert state_of(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
 
 
 def test_start_waits_until_joints_and_device_agree() -> None:
@@ -94,7 +94,7 @@ def test_start_and_stop_are_idempotent() -> None:
     for said in ("stopped", "was not steering (IDLE)"):
         reply, _ = rig.steering.on_stop()
         assert (reply.success, reply.message) == (True, said)
-        assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
+        assert state_of(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
     # Steering continues with the old estimate.
     assert rig.start() == "steering"
     assert rig.steering.reason == ""
@@ -128,7 +128,7 @@ def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.Monk
     )
     rig = Rig(started=False)
     rig.steering = steering
-    steering.on_device(HELD)
+    steering.on_device(HOLD)
     rig.joints()
     assert "the target point is" in rig.start()
     # A new obstacle stops the needle.
@@ -140,6 +140,6 @@ def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.Monk
     while not none_sent(actions := rig.expose()):
         rig.run(sent(actions))
     assert "IDLE: no path from insertion 0.0" in logged(actions)
-    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
+    assert state_of(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
     said = steering.control.path_problem(0.0)
     assert "no path to the target point is clear of the 3 obstacles, nor from any entry" in said
