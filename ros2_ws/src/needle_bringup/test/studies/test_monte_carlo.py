@@ -165,7 +165,7 @@ def test_a_part_of_a_study_gives_the_same_outcomes_as_the_whole(asked: str) -> N
         "--bias-walk 1"
     )
     (whole,) = parts_of(parse([*asked.split(), *disturbed.split()]))
-    rest = dataclasses.replace(whole, first=4, starts=whole.starts[4:], places=whole.places[4:])
+    rest = dataclasses.replace(whole, first=4, starts=whole.starts[4:], points=whole.points[4:])
     parts = [whole.of_first(4), rest]
     apart = results_of(parts, [part.run() for part in parts])
     together = results_of([whole], [whole.run()])
