@@ -33,17 +33,17 @@ def checkout() -> Path:
     raise UserError("this runs from a checkout only: scripts/simulate is missing")
 
 
-def make_folder(option: str, name: str) -> Path:
+def make_folder(option: str, name: str, *, exist_ok: bool = True) -> Path:
     """Return the folder given to an option, created if missing.
 
     Raises
     ------
     UserError
-        If it cannot be created.
+        If it cannot be created, or exists and `exist_ok` is False.
     """
     folder = Path(name).expanduser().absolute()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=exist_ok)
     except OSError as error:
         raise UserError(f"{option} {name}: {error.strerror}") from error
     return folder

@@ -63,6 +63,5 @@ def test_a_folder_is_kept_if_an_error_may_name_a_log_in_it(tmp_path: Path) -> No
         if left:
             folders[0].rmdir()
     assert make_folder("--out", str(tmp_path / "new" / "one")).is_dir()
-    (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"--out .*: File exists"):
-        make_folder("--out", str(tmp_path / "file"))
+        make_folder("--out", str(tmp_path), exist_ok=False)
