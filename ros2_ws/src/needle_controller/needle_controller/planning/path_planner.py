@@ -45,12 +45,15 @@ class NeedlePath:
         Aim of each leg in `rig`, and its length [m]. The last aim is the target.
     insertion : float
         Insertion at the beginning of the path [m].
+    curvature : float
+        Largest curvature of the path [1/m].
     length, margin, near_margin, gentle_miss, violation, cost : float
         See `PathEvaluation` [m]. A path with a violation is only followed if there is no other.
     """
 
     legs: Array
     insertion: float
+    curvature: float
     length: float
     margin: float
     near_margin: float
@@ -183,7 +186,8 @@ class PathPlanner:
             if best.violation <= 0.0 and number >= QUICK_STARTS:
                 break
             legs, draws = initial_legs(problem.start[:, 3], problem.target, number)
-            path = NeedlePath(legs, insertion, *optimize_legs(legs, problem, draws))
+            evaluation = optimize_legs(legs, problem, draws)
+            path = NeedlePath(legs, insertion, problem.curvature, *evaluation)
             if path.cost < best.cost:
                 best = path
         bonus = 0.0 if previous is None else _BETTER_BY
@@ -193,12 +197,11 @@ class PathPlanner:
     def trace(self, path: NeedlePath, tip: TipState) -> Array:
         """Return the corners of a polyline along a path from a tip, shape (N, 3) [m]."""
         settings, pose, corners = self.settings, tip.pose, np.empty((MOST_POINTS, 4))
-        curvature = settings.curvature_share * tip.curvature
         share = settings.gentle_share / settings.curvature_share
         parts = []
         for row in path.legs:
-            leg = leg_towards(pose, row, curvature, share, settings.max_rotation_per_length)
-            count = trace_leg(pose, truncated(leg, row[3]), curvature, 0.0, corners, pose)
+            leg = leg_towards(pose, row, path.curvature, share, settings.max_rotation_per_length)
+            count = trace_leg(pose, truncated(leg, row[3]), path.curvature, 0.0, corners, pose)
             parts.append(corners[:count, :3].copy())
         return np.concatenate(parts)
 
@@ -239,4 +242,4 @@ class PathPlanner:
 
 
 def _evaluated(legs: Array, problem: PathProblem, insertion: float) -> NeedlePath:
-    return NeedlePath(legs, insertion, *evaluate_path(legs, problem, 0.0))
+    return NeedlePath(legs, insertion, problem.curvature, *evaluate_path(legs, problem, 0.0))

@@ -198,3 +198,14 @@ def test_invalid_calls_raise_errors_with_the_value() -> None:
     bent = TipState(np.zeros(3), np.eye(3), math.nan)
     with pytest.raises(UserError, match="curvature = nan"):
         planner().path(bent, TARGET, Obstacles())
+
+
+def test_the_trace_ends_where_the_path_does_with_either_curvature() -> None:
+    plans = planner()
+    easy, far = np.array([0.02, 0.0, 0.1]), np.array([0.047, 0.0, 0.1])
+    path = found(plans.path(ENTRY, easy, Obstacles()))
+    assert np.linalg.norm(plans.trace(path, ENTRY)[-1] - easy) < 1e-3
+    # Only a needle that is already inserted may use its whole curvature.
+    assert plans.path(ENTRY, far, Obstacles()) is None
+    path = found(plans.path(ENTRY, far, Obstacles(), previous=path))
+    assert np.linalg.norm(plans.trace(path, ENTRY)[-1] - far) < 1e-3
