@@ -76,8 +76,8 @@ def _exposures(run: Run) -> set[int]:
 
 
 def _put_image(copy: BagCopy, message: SentMessage, source: Path) -> None:
-    image = plain_image(_STORE.deserialize_cdr(message.data, message.type_name))
-    pixels = pixels_of(image, source)
+    image: Any = _STORE.deserialize_cdr(message.data, message.type_name)
+    pixels = pixels_of(plain_image(image), source)
     if not pixels.size:
         return
     _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
