@@ -93,10 +93,10 @@ def images_at(run: Run, stamps: Stamps) -> Iterator[tuple[int, str, npt.NDArray[
     UserError
         If the bag cannot be read.
     """
-    wanted = {int(stamp): index for index, stamp in enumerate(stamps)}
+    index_of = {int(stamp): index for index, stamp in enumerate(stamps)}
     names = {run.namespace + topic: side for topic, side in TOPICS.items()}
     for topic, _, message in read_messages(run.path, lambda name: name in names):
-        index = wanted.get(to_nanoseconds(message.header.stamp))
+        index = index_of.get(to_nanoseconds(message.header.stamp))
         if index is None:
             continue
         image = plain_image(message)

@@ -72,7 +72,7 @@ def _exposures(run: Run) -> set[int]:
     depth = run.insertion_at(stamps)
     if not np.isfinite(depth).any():
         raise UserError(f"{run.path} has no exposures with a known insertion")
-    return {int(stamps[np.nanargmin(np.abs(depth - wanted))]) for wanted in DEPTHS}
+    return {int(stamps[np.nanargmin(np.abs(depth - insertion))]) for insertion in DEPTHS}
 
 
 def _put_image(copy: BagCopy, message: SentMessage, source: Path) -> None:

@@ -82,8 +82,8 @@ def test_holds_of_two_sessions_are_stamped_by_arrival() -> None:
 def test_insertion_is_interpolated(make_run: MakeRun) -> None:
     run = read_run(make_run(steps=20))
     middle = (run.joints.stamps[:-1] + run.joints.stamps[1:]) // 2
-    wanted = (np.arange(20) + 0.5) * 1e-3
-    np.testing.assert_allclose(run.insertion_at(middle), wanted, atol=1e-12)
+    expected = (np.arange(20) + 0.5) * 1e-3
+    np.testing.assert_allclose(run.insertion_at(middle), expected, atol=1e-12)
 
 
 def foreign(path: Path) -> None:

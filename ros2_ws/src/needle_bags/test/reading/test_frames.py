@@ -39,14 +39,14 @@ def test_rows_agree_with_the_typed_reader(rows: dict[str, list[dict[str, Any]]])
     def table(topic: str, columns: Sequence[str]) -> np.ndarray:
         return np.array([[row[name] for name in columns] for row in rows[topic]], float)
 
-    wanted: dict[str, tuple[Series, list[str]]] = {
+    columns_of: dict[str, tuple[Series, list[str]]] = {
         "/needle/tip": (run.tips, [f"point.{axis}" for axis in "xyz"]),
         "/sim/tip_pose": (run.truth, [f"pose.{name}" for name in POSE]),
         "/needle/estimate": (run.estimate, [f"pose.pose.{name}" for name in POSE]),
         "/joint_states": (run.joints, joints),
         "/device/joint_trajectory": (run.commands, commands),
     }
-    for topic, (series, columns) in wanted.items():
+    for topic, (series, columns) in columns_of.items():
         found = table(topic, ["stamp", "received", *columns])
         # The typed reader keeps only the first of several equal stamps.
         _, first = np.unique(found[:, 0], return_index=True)

@@ -268,17 +268,17 @@ def test_the_calibration_is_that_of_the_tracker_or_of_params(
     changed["phantom"]["refractive_index"] += 0.01
     other.write_text(yaml.safe_dump(changed))
     file = given(tmp_path, f"calibration_file: {other}", "stereo_tracker")
-    seen: list[str] = []
+    used_texts: list[str] = []
 
     def stop(_: object, __: object, used: str) -> None:
-        seen.append(used)
+        used_texts.append(used)
         raise UserError("seen")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rerun_node, "_tracker", stop)
         for arguments in ((), ("--params", file)):
             assert rerun(first_pictures, *arguments) == 2
-    assert seen == [text, other.read_text()]
+    assert used_texts == [text, other.read_text()]
 
 
 def test_bad_input_gives_a_one_line_error(
