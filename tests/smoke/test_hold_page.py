@@ -79,12 +79,12 @@ class Scene:
     def never_pressed(self, press: Callable[[], None]) -> bool:
         """Press, and return whether the hold counts."""
         self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
-        seen = len(self.states)
+        before = len(self.states)
         press()
         # The browser has processed the event when it answers.
         self.tab.run("0")
         self.let_pass(15)
-        return not any(state.pressed for state in self.states[seen:])
+        return not any(state.pressed for state in self.states[before:])
 
     def hold_pointer(self) -> None:
         self.hold(

@@ -90,8 +90,8 @@ def _kinds(needles: Sequence[TrackedPair]) -> Iterator[Finding]:
     """Yield the share found for each rig, metal, light and floor."""
     kinds: dict[str, list[TrackedPair]] = {}
     for look in needles:
-        seen = look.scene.look
-        for kind in (look.scene.rig, seen.metal, seen.lamps, seen.floor):
+        appearance = look.scene.look
+        for kind in (look.scene.rig, appearance.metal, appearance.lamps, appearance.floor):
             kinds.setdefault(kind, []).append(look)
     for kind, looks in sorted(kinds.items()):
         shares = [_found([look for look in looks if look.known is known]) for known in _LEAST]

@@ -105,14 +105,14 @@ def scenes(first_seed: int) -> list[TracedScene]:
     return found
 
 
-def drawn(folder: Path, wanted: Sequence[TracedScene]) -> Iterator[DrawnSequence]:
+def drawn(folder: Path, requested: Sequence[TracedScene]) -> Iterator[DrawnSequence]:
     """Yield stored sequences, and trace missing ones.
 
     Parameters
     ----------
     folder : Path
         Folder of the sequences.
-    wanted : sequence of TracedScene
+    requested : sequence of TracedScene
         Requested sequences.
 
     Raises
@@ -121,7 +121,7 @@ def drawn(folder: Path, wanted: Sequence[TracedScene]) -> Iterator[DrawnSequence
         If one has to be traced and the path tracer is not installed.
     """
     folder.mkdir(exist_ok=True)
-    for scene in wanted:
+    for scene in requested:
         kept = folder / f"{scene.name}.npz"
         calibration = _calibration(folder, scene)
         if not kept.is_file():
@@ -165,11 +165,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folder", metavar="DIR", help="folder; existing sequences are kept")
     parser.add_argument("--held-back", action="store_true", help="only the half that is held back")
     given = parser.parse_args(arguments)
-    wanted = scenes(HELD_BACK) + ([] if given.held_back else scenes(LOOKED_AT))
+    requested = scenes(HELD_BACK) + ([] if given.held_back else scenes(LOOKED_AT))
 
     def draw() -> int:
-        sequences = drawn(Path(given.folder).expanduser(), wanted)
-        for _ in tqdm(sequences, total=len(wanted), disable=not sys.stderr.isatty()):
+        sequences = drawn(Path(given.folder).expanduser(), requested)
+        for _ in tqdm(sequences, total=len(requested), disable=not sys.stderr.isatty()):
             pass
         return EXIT_DONE
 
