@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,8 +15,7 @@ from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.format.bag_metadata import USUAL_QOS
-from needle_bags.format.bag_writer import BagWriter
-from needle_core.files.bag_topic import BagTopic
+from needle_bags.format.bag_writer import BagWriter, standard_topic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STEPS = 120
@@ -28,6 +28,10 @@ STEP_WALL_NS = 50_000_000
 
 def message(type_name: str, **fields: Any) -> Any:
     return STORE.types[type_name](**fields)
+
+
+def serialized(content: Any) -> bytes:
+    return bytes(STORE.serialize_cdr(content, content.__msgtype__))
 
 
 def header(nanoseconds: int, frame: str = "rig") -> Any:
@@ -65,12 +69,10 @@ class SyntheticBag:
         name, kind = self.namespace + topic, content.__msgtype__
         if name not in self.channels:
             durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
-            definition = STORE.generate_msgdef(kind, ros_version=2)[0]
             qos = USUAL_QOS._replace(durability=durability)
-            described = BagTopic(name, kind, definition, STORE.hash_rihs01(kind), (qos,))
+            described = dataclasses.replace(standard_topic(name, kind), offered_qos=(qos,))
             self.channels[name] = self.bag.add_topic(described)
-        data = bytes(STORE.serialize_cdr(content, kind))
-        self.bag.write(self.channels[name], data, self.now, self.now)
+        self.bag.write(self.channels[name], serialized(content), self.now, self.now)
 
 
 def write_run(
