@@ -240,9 +240,9 @@ def _plan_view(run: Run, frames: Sequence[Frame], axis: int, name: str) -> View:
         known.append(point[None])
     elif axis == 0:
         known.append(np.array([[plane - GOAL, 0.0, 0.0], [plane + GOAL, 0.0, 0.0]]))
-    places = np.concatenate(known) * MM
+    points = np.concatenate(known) * MM
     with stacked(1, 2.5, top=0.12) as (figure, (axes,)):
-        low, high = places.min(axis=0), places.max(axis=0)
+        low, high = points.min(axis=0), points.max(axis=0)
         margin = 0.06 * (high - low) + 0.2
         axes.set_xlim(low[2] - margin[2], high[2] + margin[2])
         axes.set_ylim(low[axis] - margin[axis], high[axis] + margin[axis])
