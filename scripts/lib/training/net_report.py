@@ -108,15 +108,15 @@ def end_error(intensity: Array, share: Array, end: Array) -> EndError | None:
         True end, column and row [px].
     """
     rows, columns = np.indices(intensity.shape)
-    places = np.stack([columns, rows], axis=-1)
-    away = np.hypot(*np.moveaxis(places - end, -1, 0))
+    pixels = np.stack([columns, rows], axis=-1)
+    away = np.hypot(*np.moveaxis(pixels - end, -1, 0))
     if intensity[away <= _NEAR_PX].sum() <= _SEEN:
         return None
     shaft = (share > 0.5) & (away < _SHAFT_PX)
-    ahead = end - places[shaft].mean(axis=0) if shaft.any() else np.array([1.0, 0.0])
+    ahead = end - pixels[shaft].mean(axis=0) if shaft.any() else np.array([1.0, 0.0])
     ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
     near = away <= _AROUND_PX
-    weights, around = intensity[near], places[near].astype(np.float64)
+    weights, around = intensity[near], pixels[near].astype(np.float64)
     centre = weights @ around / weights.sum()
     spread = (weights * (around - centre).T) @ (around - centre) / weights.sum()
     error = centre - end
@@ -158,8 +158,8 @@ def _count(figures: Figures, shaft: Array, log_intensity: Array, share: Array, e
     figures.end_loss += float(intensity.sum())
     if np.isfinite(end).all():
         figures.ends += 1
-        place = np.asarray([[end]], np.float32)
-        at_end = cv2.remap(intensity, place, None, cv2.INTER_LINEAR)
+        pixel = np.asarray([[end]], np.float32)
+        at_end = cv2.remap(intensity, pixel, None, cv2.INTER_LINEAR)
         figures.end_loss -= float(np.log(max(float(np.ravel(at_end)[0]), 1e-9)))
         error = end_error(intensity, share, end)
         if error is not None:
