@@ -15,7 +15,8 @@ from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.format.bag_metadata import USUAL_QOS
-from needle_bags.format.bag_writer import BagWriter, standard_topic
+from needle_bags.format.bag_writer import BagCopy, BagWriter, standard_topic
+from needle_bags.reading.bag_messages import SentMessage, raw_as_sent, read_contents
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STEPS = 120
@@ -56,6 +57,17 @@ def status(values: Mapping[str, object]) -> Any:
     pairs = [message(kind, key=key, value=str(value)) for key, value in values.items()]
     texts = {"name": "n", "message": "m", "hardware_id": "h"}
     return message("diagnostic_msgs/msg/DiagnosticStatus", level=0, values=pairs, **texts)
+
+
+def copy_messages(
+    source: Path, copy: BagCopy, change: Callable[[SentMessage], bytes | None] = lambda m: m.data
+) -> None:
+    """Copy the messages of a bag; `change` returns their data, or None to leave one out."""
+    topics = read_contents(source).topics
+    for one in raw_as_sent(source, lambda _: True):
+        data = change(one)
+        if data is not None:
+            copy.put(topics[one.topic], data, one.log_time, one.time)
 
 
 class SyntheticBag:
