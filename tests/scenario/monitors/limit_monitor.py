@@ -12,7 +12,7 @@ from needle_device_driver.supervisor.limits import SafetyLimits
 _SET_POINT_PERIOD = 0.02
 # A drive lags by its following error and by these set-points: the error is computed from a position
 # of the previous cycle, one cycle later, and one more set-point may be in transit.
-_SET_POINTS_LAGGING = 3
+_SET_POINTS_BEHIND = 3
 # Overshoot of the drives beyond the limits [m], [rad].
 _DEPTH_MARGIN, _ROTATION_MARGIN = 0.0011, 0.3
 # Function codes of the process data that carry controlword and mode, and the target (CiA 402).
@@ -133,7 +133,7 @@ class LimitMonitor:
         self._early = _SET_POINT_PERIOD + late
 
         def axis(name: str, unit: str, scale: float, speed: float, lag: float) -> _Axis:
-            lag += _SET_POINTS_LAGGING * _SET_POINT_PERIOD * speed
+            lag += _SET_POINTS_BEHIND * _SET_POINT_PERIOD * speed
             return _Axis(name, unit, scale, speed, lag, SpeedBudget(speed), SpeedBudget(speed))
 
         self._axes = (
