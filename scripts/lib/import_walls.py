@@ -15,7 +15,7 @@ from importlinter import Contract, ContractCheck, fields, output
 ROS = re.compile(r"rclpy|rosidl_.*|launch|launch_ros|.*_msgs|.*_interfaces|std_srvs")
 
 
-def is_in_room(module: str) -> bool:
+def is_in_ros(module: str) -> bool:
     """Return whether a module is in its package's subpackage `ros`."""
     return module.split(".")[1:2] == ["ros"]
 
@@ -25,7 +25,7 @@ def is_ros(module: str) -> bool:
     return ROS.fullmatch(module.partition(".")[0]) is not None
 
 
-class RosRoomContract(Contract):
+class RosFolderContract(Contract):
     """Contract that pure modules import neither ROS nor a module of a subpackage `ros`."""
 
     packages = fields.ListField(subfield=fields.StringField())
@@ -35,10 +35,10 @@ class RosRoomContract(Contract):
         ours = tuple(str(name) for name in cast("list[str]", self.packages))
         broken = []
         for importer in sorted(graph.modules):
-            if not importer.startswith(ours) or is_in_room(importer):
+            if not importer.startswith(ours) or is_in_ros(importer):
                 continue
             for imported in sorted(graph.find_modules_directly_imported_by(importer)):
-                inside = imported.startswith(ours) and is_in_room(imported)
+                inside = imported.startswith(ours) and is_in_ros(imported)
                 if not (inside or is_ros(imported)):
                     continue
                 details = graph.get_import_details(importer=importer, imported=imported)
@@ -48,7 +48,7 @@ class RosRoomContract(Contract):
 
     def render_broken_contract(self, check: ContractCheck) -> None:
         """Print the imports that break the contract."""
-        output.print_error("Only modules of the rooms `ros` may import ROS or each other:")
+        output.print_error("Only modules of the folders `ros` may import ROS or each other:")
         output.new_line()
         for line in check.metadata["broken"]:
             output.print_error(f"- {line}")

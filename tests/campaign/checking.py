@@ -37,7 +37,7 @@ class Finding:
         Short name, for `--json`.
     what : str
         Description of the figure.
-    wanted, seen : str
+    required, measured : str
         Required and measured value, as text.
     passed : bool
         Whether the measured value meets the requirement.
@@ -45,8 +45,8 @@ class Finding:
 
     key: str
     what: str
-    wanted: str
-    seen: str
+    required: str
+    measured: str
     passed: bool
 
 
@@ -54,16 +54,16 @@ def at_least(
     key: str, what: str, bound: float, value: float, unit: str = "", form: str = ".4g"
 ) -> Finding:
     """Return a finding that passes if a value reaches a bound; both are shown in a format."""
-    wanted, seen = (f"{number:{form}}{unit}" for number in (bound, value))
-    return Finding(key, what, f">= {wanted}", seen, value >= bound)
+    required, measured = (f"{number:{form}}{unit}" for number in (bound, value))
+    return Finding(key, what, f">= {required}", measured, value >= bound)
 
 
 def at_most(
     key: str, what: str, bound: float, value: float, unit: str = "", form: str = ".4g"
 ) -> Finding:
     """Return a finding that passes if a value does not exceed a bound; see `at_least`."""
-    wanted, seen = (f"{number:{form}}{unit}" for number in (bound, value))
-    return Finding(key, what, f"<= {wanted}", seen, value <= bound)
+    required, measured = (f"{number:{form}}{unit}" for number in (bound, value))
+    return Finding(key, what, f"<= {required}", measured, value <= bound)
 
 
 Check = Callable[["Workbench"], Iterator[Finding]]
@@ -174,13 +174,13 @@ def bag_read_error(bag: Path) -> str:
         with Reader(bag) as reader:
             count = sum(1 for _ in reader.messages())
             told = reader.message_count
-        seen = 0
+        measured = 0
         for file in bag.glob("*.mcap"):
             with file.open("rb") as stream:
-                seen += sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages())
+                measured += sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages())
     # Any error is a finding.
     except Exception as error:  # noqa: BLE001
         return f"{type(error).__name__}: {error}"
-    if told == count == seen:
+    if told == count == measured:
         return ""
-    return f"metadata.yaml reports {told} messages, rosbags reads {count}, mcap {seen}"
+    return f"metadata.yaml reports {told} messages, rosbags reads {count}, mcap {measured}"

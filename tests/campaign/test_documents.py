@@ -77,10 +77,10 @@ def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
         depth = ARC_MM if "--controller open_loop" in words else SHORT_MM
         words = re.sub(r"--depth-mm \d+", "", words) + f" --depth-mm {depth}"
         words = re.sub(r"--target \S+", f"--target 0,0,{SHORT_MM - 1}", words)
-        wanted = re.search(r" --bag (\S+)", words)
-        bag = wanted[1] if wanted else f"{scratch}/run_{next(numbers)}"
-        words = " ".join(words.replace(wanted[0] if wanted else "", "").split())
-        if wanted and words in runs:
+        given_bag = re.search(r" --bag (\S+)", words)
+        bag = given_bag[1] if given_bag else f"{scratch}/run_{next(numbers)}"
+        words = " ".join(words.replace(given_bag[0] if given_bag else "", "").split())
+        if given_bag and words in runs:
             return f"cp -r {runs[words]} {bag}"
         if bag.startswith("/"):
             runs[words] = bag

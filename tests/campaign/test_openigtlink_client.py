@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import struct
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -16,37 +15,37 @@ from scipy.spatial.transform import Rotation
 from needle_bags.link.link_port import LinkPort
 from needle_bags.link.openigtlink import OpenIGTLink, OpenIGTLinkParameters, packed
 from needle_bags.live.live_needle import LiveNeedle, MeasuredTip
-from needle_core import messages as m
 from needle_core.component import Moment, Publish, Send
 from needle_core.openigtlink import LinkStream
-from needle_core.status_messages import ControllerStatus
 
+pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
 LIMIT = 20.0
 TIP = (0.001, 0.002, 0.04)
 TURN = Rotation.from_euler("xyz", (0.1, 0.2, 0.3))
 AT = Moment(0.0, 7_000_000_000)
 
 
+@pytest.fixture
+def needle() -> LiveNeedle:
+    needle = LiveNeedle()
+    needle.set_insertion(0.04)
+    needle.set_targets(0.003, np.array((0.01, 0.0, 0.1)))
+    needle.add_tip(MeasuredTip(5_250_000_000, np.array(TIP), TURN.as_quat(), np.eye(3)))
+    return needle
+
+
 class Scene:
     """The component at its real port, and a client outside of ROS, like Slicer."""
 
-    def __init__(self, client: Any) -> None:
+    def __init__(self) -> None:
         self.component = OpenIGTLink(OpenIGTLinkParameters(port=0))
         self.port = LinkPort("127.0.0.1", 0)
         self.arrived: deque[Any] = deque()
         self.port.open(self.arrived.append)
-        self.client = client("127.0.0.1", self.port.port)
+        self.client = pyigtl.OpenIGTLinkClient("127.0.0.1", self.port.port)
         self.proposals: list[Any] = []
 
-    def say(self, topic: str, message: Any) -> None:
-        (row,) = (row for row in self.component.inputs if row.topic == topic)
-        list(row.handler(message, AT))
-
-    def hears(self, name: str) -> Any:
-        """Return the next message with a name."""
-        return self.awaits(lambda: self.client.wait_for_message(name, timeout=0))
-
-    def awaits(self, condition: Callable[[], Any]) -> Any:
+    def wait_for(self, condition: Callable[[], Any]) -> Any:
         """Run component and port until a condition has a value; return it."""
         deadline = time.monotonic() + LIMIT
         while not (found := condition()):
@@ -60,49 +59,42 @@ class Scene:
             time.sleep(0.005)
         return found
 
-    def close(self) -> None:
-        self.client.stop()
-        self.port.close()
+
+@pytest.fixture
+def scene(needle: LiveNeedle) -> Iterator[Scene]:
+    scene = Scene()
+    scene.component._needle = needle
+    yield scene
+    scene.client.stop()
+    scene.port.close()
 
 
-def test_pyigtls_client_receives_the_needle_in_mm() -> None:
-    pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
-    with contextlib.closing(Scene(pyigtl.OpenIGTLinkClient)) as scene:
-        assert scene.hears("NeedleStatus").string == "no needle data received"
-        status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
-        scene.say("needle/controller_status", status)
-        x, y, z, w = TURN.as_quat().tolist()
-        covariance = tuple(np.diag(np.full(6, 1e-8)).ravel().tolist())
-        tip_pose = m.PoseWithCovariance(5_250_000_000, "rig", TIP, (x, y, z, w), covariance)
-        scene.say("joint_states", m.JointState(1, ("insertion_joint",), (0.04,)))
-        scene.say("needle/tip_pose", tip_pose)
-        tip = scene.hears("NeedleTipToRig")
-        np.testing.assert_allclose(tip.matrix[:3, 3], np.array(TIP) * 1e3, rtol=1e-6)
-        np.testing.assert_allclose(tip.matrix[:3, :3], TURN.as_matrix(), atol=1e-6)
-        assert tip.timestamp == pytest.approx(5.25)
-        (target,) = scene.hears("NeedleTarget").positions
-        assert target == pytest.approx((10.0, 0.0, 100.0))
+def test_pyigtls_client_receives_the_needle_in_mm(scene: Scene) -> None:
+    def receive(name: str) -> Any:
+        return scene.wait_for(lambda: scene.client.wait_for_message(name, timeout=0))
+
+    assert receive("NeedleStatus").string == "tip found"
+    tip = receive("NeedleTipToRig")
+    np.testing.assert_allclose(tip.matrix[:3, 3], np.array(TIP) * 1e3, rtol=1e-6)
+    np.testing.assert_allclose(tip.matrix[:3, :3], TURN.as_matrix(), atol=1e-6)
+    assert tip.timestamp == pytest.approx(5.25)
+    (target,) = receive("NeedleTarget").positions
+    assert target == pytest.approx((10.0, 0.0, 100.0))
 
 
-def test_a_target_of_pyigtls_client_is_proposed_in_m() -> None:
-    pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
-    with contextlib.closing(Scene(pyigtl.OpenIGTLinkClient)) as scene:
-        scene.hears("NeedleStatus")
-        for version in (1, 2):
-            at = [[10.0, -5.0, 90.0 + version], [0.1, 0.0, 0.0]]
-            plan = pyigtl.PointMessage(at, ["Target-1", "Entry-1"], device_name="Plan")
-            plan.header_version, plan.metadata = version, {"unit": "mm"} if version == 2 else {}
-            scene.client.send_message(plan, wait=False)
-            (point,) = scene.awaits(lambda: scene.proposals)
-            scene.proposals.clear()
-            assert point.position == pytest.approx((0.01, -0.005, 0.09 + version * 1e-3))
+def test_a_target_of_pyigtls_client_is_proposed_in_m(scene: Scene) -> None:
+    for version in (1, 2):
+        at = [[10.0, -5.0, 90.0 + version], [0.1, 0.0, 0.0]]
+        plan = pyigtl.PointMessage(at, ["Target-1", "Entry-1"], device_name="Plan")
+        plan.header_version, plan.metadata = version, {"unit": "mm"} if version == 2 else {}
+        scene.wait_for(scene.client.is_connected)
+        scene.client.send_message(plan, wait=False)
+        (point,) = scene.wait_for(lambda: scene.proposals)
+        scene.proposals.clear()
+        assert point.position == pytest.approx((0.01, -0.005, 0.09 + version * 1e-3))
 
 
-def test_the_shape_is_a_polydata_line_in_mm() -> None:
-    pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
-    needle = LiveNeedle()
-    needle.set_insertion(0.04)
-    needle.add_tip(MeasuredTip(1, np.array(TIP), TURN.as_quat(), np.eye(3)))
+def test_the_shape_is_a_polydata_line_in_mm(needle: LiveNeedle) -> None:
     (message,) = (one for one in LinkStream().split(packed(needle, 1.0)) if one.kind == "POLYDATA")
     # As in http://openigtlink.org/protocols/v2_polydata.html.
     counts, data = struct.unpack(">10I", message.body[:40]), message.body[40:]

@@ -73,7 +73,7 @@ def test_a_small_bright_sphere_is_imaged_according_to_snells_law(
         expected = project(point, camera)
         corner = np.rint(expected).astype(int) - 4
         pixels = corner + np.mgrid[:9, :9].reshape(2, -1).T
-        light, cover, way = PathTracer(mitsuba).layer(
+        light, cover, travelled = PathTracer(mitsuba).layer(
             scene,  # type: ignore[arg-type]
             pixels,
             camera,
@@ -83,11 +83,11 @@ def test_a_small_bright_sphere_is_imaged_according_to_snells_law(
         )
         np.testing.assert_allclose(light, cover, atol=1e-5)
         rays = refracted_rays(expected, camera, rig)
-        assert way.sum() / cover.sum() == pytest.approx(
+        assert travelled.sum() / cover.sum() == pytest.approx(
             np.linalg.norm(point - rays.origin), abs=2e-4
         )
-        seen = (light[:, np.newaxis] * pixels).sum(axis=0) / light.sum()
-        assert np.abs(seen - expected).max() < 0.1
+        pixel = (light[:, np.newaxis] * pixels).sum(axis=0) / light.sum()
+        assert np.abs(pixel - expected).max() < 0.1
 
 
 def test_the_same_seed_gives_the_same_pairs_with_a_needle_in_them(mitsuba: Mitsuba) -> None:
@@ -109,8 +109,8 @@ def test_the_same_seed_gives_the_same_pairs_with_a_needle_in_them(mitsuba: Mitsu
         ):
             np.testing.assert_array_equal(image, same)
             shaft = one.meshes[0].parts["shaft"].points[::40]
-            seen = project(shaft, camera)
-            u, v = np.rint(seen[seen[:, 0] > 30.0]).astype(int).T
+            pixel = project(shaft, camera)
+            u, v = np.rint(pixel[pixel[:, 0] > 30.0]).astype(int).T
             darker = nothing[v, u].astype(float) - image[v, u]
             assert np.median(darker) > 20.0
 
@@ -128,17 +128,17 @@ def test_the_command_fills_a_folder(mitsuba: Mitsuba, tmp_path: Path) -> None:
 def test_mirroring_the_floor_mirrors_its_image(mitsuba: Mitsuba) -> None:
     look = dataclasses.replace(draw_appearance("drawn_on_grey", 3), bubbles=0)
     world = make_world(load_stereo_rig(CALIBRATION), look)
-    behind = world.backdrops[0]
-    shape = behind.picture.shape
+    backdrop = world.backdrops[0]
+    shape = backdrop.picture.shape
     slanting = np.linspace(0.1, 0.5, shape[0])[:, np.newaxis] + np.linspace(0.0, 0.4, shape[1])
-    behind = dataclasses.replace(behind, picture=slanting.astype(np.float32))
-    scene = Scene(mitsuba, dataclasses.replace(world, backdrops=(behind, behind)))
-    places = np.array([[look.floor_height, y, z] for y in (-0.04, 0.05) for z in (0.02, 0.12)])
-    above = (MM * (places + np.array([0.01, 0.0, 0.0]))).astype(np.float32)
+    backdrop = dataclasses.replace(backdrop, picture=slanting.astype(np.float32))
+    scene = Scene(mitsuba, dataclasses.replace(world, backdrops=(backdrop, backdrop)))
+    points = np.array([[look.floor_height, y, z] for y in (-0.04, 0.05) for z in (0.02, 0.12)])
+    above = (MM * (points + np.array([0.01, 0.0, 0.0]))).astype(np.float32)
     down = mitsuba.mi.Vector3f(-1.0, 0.0, 0.0)
     hit = scene.tracer.ray_intersect(mitsuba.mi.Ray3f(mitsuba.mi.Point3f(*above.T), down))
-    seen = np.asarray(hit.bsdf().eval_diffuse_reflectance(hit)).ravel()
-    np.testing.assert_allclose(seen, behind.reflectance(places[np.newaxis])[0], atol=0.002)
+    pixel = np.asarray(hit.bsdf().eval_diffuse_reflectance(hit)).ravel()
+    np.testing.assert_allclose(pixel, backdrop.reflectance(points[np.newaxis])[0], atol=0.002)
 
 
 def test_a_needle_in_a_box_is_seen_by_both_and_farther_in_by_the_later_one(

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-import shlex
 import subprocess
 import threading
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 
 import pytest
 import rclpy
@@ -23,6 +21,7 @@ from needle_core.files.installed import find_executable
 from needle_core.process.ros_domain import reserve_domain_id
 
 LIMIT = 60.0
+Ros2 = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 class Partner(Node):
@@ -79,60 +78,46 @@ def partner(domain: int) -> Iterator[Partner]:
 
 
 @pytest.fixture
-def ros2(domain: int, partner: Partner) -> type[Ros2]:
-    del partner
-    Ros2.domain = domain
-    return Ros2
+def ros2(domain: int, partner: Partner) -> Ros2:
+    """Return a function that runs `ros2 ARGUMENTS` in the partner's domain."""
+    command = find_executable("needle_core", "ros2")
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+    return lambda *arguments: subprocess.run(
+        [command, *arguments],
+        check=False,
+        env=environment,
+        text=True,
+        capture_output=True,
+        timeout=LIMIT,
+    )
 
 
-class Ros2:
-    """`ros2 ARGUMENTS` in the partner's domain."""
-
-    domain = 0
-
-    def __init__(self, *arguments: str) -> None:
-        result = subprocess.run(
-            [find_executable("needle_core", "ros2"), *arguments],
-            check=False,
-            env={**os.environ, "ROS_DOMAIN_ID": str(self.domain)},
-            text=True,
-            capture_output=True,
-            timeout=LIMIT,
-        )
-        self.code, self.out, self.err = result.returncode, result.stdout, result.stderr
-
-
-def at_once(ros2: type[Ros2], *commands: str) -> list[Ros2]:
-    """Run commands in parallel, because each takes seconds."""
-    with ThreadPoolExecutor() as pool:
-        return list(pool.map(lambda command: ros2(*shlex.split(command)), commands))
-
-
-def test_lists_nodes_and_topics(ros2: type[Ros2]) -> None:
+def test_lists_nodes_and_topics(ros2: Ros2) -> None:
     # The node of another command is also in the graph, but hidden.
-    nodes, topics = at_once(ros2, "node list", "topic list")
-    assert nodes.out == "/rig/partner\n"
-    assert "/rig/hold" in topics.out.splitlines()
+    assert ros2("node", "list").stdout == "/rig/partner\n"
+    assert "/rig/hold" in ros2("topic", "list").stdout.splitlines()
 
 
-def test_echo_receives_earlier_messages_and_shortens_arrays(ros2: type[Ros2]) -> None:
+def test_echo_receives_earlier_messages_and_shortens_arrays(ros2: Ros2) -> None:
     expected = "stamp:\n  sec: 0\n  nanosec: 0\nframe_id: above\n---\n"
-    assert ros2("topic", "echo", "--once", "/rig/status").out == expected
-    assert ros2("topic", "echo", "--once", "/rig/status", "--field", "frame_id").out == (
+    assert ros2("topic", "echo", "--once", "/rig/status").stdout == expected
+    assert ros2("topic", "echo", "--once", "/rig/status", "--field", "frame_id").stdout == (
         "above\n---\n"
     )
     of_another = ros2(
         "topic", "echo", "/rig/status", "--filter", "not m.frame_id", "--timeout", "1"
     )
-    assert of_another.out == ""
-    assert ros2("topic", "echo", "--once", "/rig/status", "--filter", "m.frame_id").out == expected
-    axes = ros2("topic", "echo", "--once", "/rig/axes").out
+    assert of_another.stdout == ""
+    assert (
+        ros2("topic", "echo", "--once", "/rig/status", "--filter", "m.frame_id").stdout == expected
+    )
+    axes = ros2("topic", "echo", "--once", "/rig/axes").stdout
     assert axes.count("- 0.5\n") == 128
     assert "- '...'\n" in axes
 
 
 def test_pub_sends_the_requested_messages_with_increasing_stamps(
-    ros2: type[Ros2], partner: Partner
+    ros2: Ros2, partner: Partner
 ) -> None:
     partner.heard.clear()
     said = ros2(
@@ -140,8 +125,8 @@ def test_pub_sends_the_requested_messages_with_increasing_stamps(
         "sensor_msgs/msg/Joy",
         "{header: {stamp: now, frame_id: me}, axes: [1], buttons: [1]}",
     )  # fmt: skip
-    assert (said.code, said.err) == (0, "")
-    assert said.out.endswith("publisher: beginning loop\n")
+    assert (said.returncode, said.stderr) == (0, "")
+    assert said.stdout.endswith("publisher: beginning loop\n")
     stamps = [(m.header.stamp.sec, m.header.stamp.nanosec) for m in partner.heard]
     assert len(stamps) == 5
     assert sorted(set(stamps)) == stamps
@@ -150,36 +135,35 @@ def test_pub_sends_the_requested_messages_with_increasing_stamps(
     assert list(partner.heard[0].buttons) == [1]
 
 
-def test_call_prints_request_and_answer(ros2: type[Ros2], partner: Partner) -> None:
+def test_call_prints_request_and_answer(ros2: Ros2, partner: Partner) -> None:
     partner.asked.clear()
     said = ros2("service", "call", "/rig/enable", "std_srvs/srv/SetBool", "{data: true}")
     assert partner.asked == [True]
-    assert "requester: making request: std_srvs.srv.SetBool_Request(data=True)\n" in said.out
+    assert "requester: making request: std_srvs.srv.SetBool_Request(data=True)\n" in said.stdout
     answer = "response:\nstd_srvs.srv.SetBool_Response(success=True, message='heard')\n\n"
-    assert said.out.endswith(answer)
+    assert said.stdout.endswith(answer)
 
 
-def test_parameters_are_read_and_set(ros2: type[Ros2]) -> None:
-    assert ros2("param", "get", "/rig/partner", "speed").out == "Double value is: 0.005\n"
-    assert ros2("param", "get", "rig/partner", "names").out == "String_array value is: ['a', 'b']\n"
-    assert ros2("param", "set", "/rig/partner", "speed", "0.25").out == (
+def test_parameters_are_read_and_set(ros2: Ros2) -> None:
+    assert ros2("param", "get", "/rig/partner", "speed").stdout == "Double value is: 0.005\n"
+    assert (
+        ros2("param", "get", "rig/partner", "names").stdout == "String_array value is: ['a', 'b']\n"
+    )
+    assert ros2("param", "set", "/rig/partner", "speed", "0.25").stdout == (
         "Set parameter successful\n"
     )
-    assert ros2("param", "get", "/rig/partner", "speed").out == "Double value is: 0.25\n"
+    assert ros2("param", "get", "/rig/partner", "speed").stdout == "Double value is: 0.25\n"
 
 
-def test_a_missing_answer_is_reported(domain: int, ros2: type[Ros2]) -> None:
+def test_a_missing_answer_is_reported(domain: int, ros2: Ros2) -> None:
     context = Context()
     rclpy.init(context=context, domain_id=domain)
     deaf = Node("deaf", context=context)  # never spun
     deaf.create_service(SetBool, "deaf/enable", lambda _, response: response)
-    call, get = at_once(
-        ros2,
-        "service call /deaf/enable std_srvs/srv/SetBool '{data: true}'",
-        "param get /deaf speed",
-    )
-    assert (call.code, call.err) == (1, "no answer from /deaf/enable\n")
-    assert (get.code, get.err) == (1, "no answer from /deaf\n")
+    call = ros2("service", "call", "/deaf/enable", "std_srvs/srv/SetBool", "{data: true}")
+    get = ros2("param", "get", "/deaf", "speed")
+    assert (call.returncode, call.stderr) == (1, "no answer from /deaf/enable\n")
+    assert (get.returncode, get.stderr) == (1, "no answer from /deaf\n")
     deaf.destroy_node()
     rclpy.try_shutdown(context=context)
 
@@ -198,8 +182,8 @@ def test_a_missing_answer_is_reported(domain: int, ros2: type[Ros2]) -> None:
         (("param", "get", "/rig/partner", "nothing"), "Parameter not set"),
     ],
 )
-def test_errors_are_one_line(ros2: type[Ros2], arguments: tuple[str, ...], words: str) -> None:
+def test_errors_are_one_line(ros2: Ros2, arguments: tuple[str, ...], words: str) -> None:
     said = ros2(*arguments)
-    assert said.code == 1
-    assert words in said.err
-    assert len(said.err.splitlines()) == 1
+    assert said.returncode == 1
+    assert words in said.stderr
+    assert len(said.stderr.splitlines()) == 1

@@ -234,7 +234,7 @@ class Session:
 
     def _run(self, command: str) -> str:
         command = self._change(command)
-        wanted = re.search(r"exit code (\d+)", command)
+        expected = re.search(r"exit code (\d+)", command)
         with tempfile.TemporaryFile("w+") as output:
             process = self._open(command, subprocess.DEVNULL, output)
             try:
@@ -246,7 +246,7 @@ class Session:
             output.seek(0)
             said = output.read()
         self.said.append(said)
-        if code != int(wanted[1] if wanted else 0):
+        if code != int(expected[1] if expected else 0):
             raise PageError(f"{command}\nends with {code}: {said}")
         return said
 

@@ -80,7 +80,7 @@ def _verify(arguments: Sequence[str]) -> int:
                 findings.append((step, finding))
                 _show(step, finding)
     failed = sum(not finding.passed for _, finding in findings)
-    print(f"{len(findings) - failed} of {len(findings)} as wanted")
+    print(f"{len(findings) - failed} of {len(findings)} as required")
     if given.json:
         write_json(Path(given.json), _flat(findings, time.monotonic() - begin))
     return EXIT_MISSED if failed else EXIT_DONE
@@ -110,7 +110,7 @@ def _chosen(steps: Sequence[str], only: Sequence[str] | None) -> list[tuple[str,
 def _show(step: str, finding: Finding) -> None:
     mark = "ok  " if finding.passed else "MISS"
     print(f"{mark} {step} {finding.what}")
-    print(f"         wanted {finding.wanted}\n         seen   {finding.seen}", flush=True)
+    print(f"         required {finding.required}\n         measured {finding.measured}", flush=True)
 
 
 def _flat(findings: Sequence[tuple[str, Finding]], wall: float) -> dict[str, JsonValue]:
@@ -120,8 +120,8 @@ def _flat(findings: Sequence[tuple[str, Finding]], wall: float) -> dict[str, Jso
     }
     for step, finding in findings:
         values[f"{step}_{finding.key}"] = finding.passed
-        values[f"{step}_{finding.key}_wanted"] = finding.wanted
-        values[f"{step}_{finding.key}_seen"] = finding.seen
+        values[f"{step}_{finding.key}_wanted"] = finding.required
+        values[f"{step}_{finding.key}_seen"] = finding.measured
     return values
 
 

@@ -113,10 +113,10 @@ class ProcessMonitor(RosRigClient):
     def _on_command(self, message: JointTrajectory) -> None:
         self.watch.observe_command([(at.positions[0], at.positions[1]) for at in message.points])
 
-    def _on_places(self, message: JointState, info: dict[str, int]) -> None:
-        before = self.places[-1].time if self.places else 0.0
-        super()._on_places(message, info)
-        at = self.places[-1]
+    def _on_joints(self, message: JointState, info: dict[str, int]) -> None:
+        before = self.positions[-1].time if self.positions else 0.0
+        super()._on_joints(message, info)
+        at = self.positions[-1]
         moved_at = at.time - self._begun
         if at.time - before > _WITHOUT_SYNC:
             self.watch.observe_drives_go_on(moved_at)

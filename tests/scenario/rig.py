@@ -294,8 +294,8 @@ class SoakRig:
 
     def _apply_faults(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals | None:
         if link.topic == CAN and link.sender == "device_driver":
-            for see in () if self._adapter_is_open else self.adapter_opened:
-                see()
+            for watch_opening in () if self._adapter_is_open else self.adapter_opened:
+                watch_opening()
             self._adapter_is_open = True
             for take in self.frames_sent:
                 take(message)

@@ -191,18 +191,18 @@ def _watch_set_points(rig: SoakRig, watch: InvariantMonitor) -> None:
     axes = {its.node_id: axis for axis, its in enumerate(settings)}
     frames = SetPointFrames({its.node_id: its.motor.counts_per_unit for its in settings})
 
-    def see(batch: Sequence[Any]) -> None:
+    def watch_frames(batch: Sequence[Any]) -> None:
         for frame in batch:
             if (set_point := frames.take(frame.identifier, frame.data)) is not None:
-                node, place = set_point
-                watch.observe_set_point(rig.now, axes[node], place)
+                node, position = set_point
+                watch.observe_set_point(rig.now, axes[node], position)
 
-    rig.frames_sent.append(see)
+    rig.frames_sent.append(watch_frames)
 
 
-def _rounded(place: Sequence[float]) -> bytes:
+def _rounded(position: Sequence[float]) -> bytes:
     """Return a position for the digest, to 1 nm and 1 nrad: numpy versions differ in last bits."""
-    return " ".join(f"{value:.9f}" for value in place).encode() + b"\n"
+    return " ".join(f"{value:.9f}" for value in position).encode() + b"\n"
 
 
 def _has_left(rig: SoakRig) -> bool:

@@ -68,7 +68,7 @@ class ScheduleRunner:
         self._timeline = timeline
         self._begin = begin
         self._waiting = list(faults)
-        self._under_way = 0
+        self._active = 0
         self._count: Counter[Moment] = Counter()
         self.reached: list[ReachedMoment] = []
         self.begun: list[tuple[Fault, float]] = []
@@ -76,7 +76,7 @@ class ScheduleRunner:
     @property
     def has_active(self) -> bool:
         """Whether a fault is active, or its moment was reached."""
-        return self._under_way > 0
+        return self._active > 0
 
     @property
     def has_pending(self) -> bool:
@@ -90,7 +90,7 @@ class ScheduleRunner:
         self.reached.append(ReachedMoment(*this, self._timeline.now))
         for fault in [one for one in self._waiting if (one.after, one.nth) == this]:
             self._waiting.remove(fault)
-            self._under_way += 1
+            self._active += 1
             self._timeline.call_after(fault.at, partial(self._happen, fault))
 
     def cancel_pending(self) -> None:
@@ -103,7 +103,7 @@ class ScheduleRunner:
 
     def _end(self, undo: Undo) -> None:
         undo()
-        self._under_way -= 1
+        self._active -= 1
 
 
 def watch_moments(rig: SoakRig, reach: Callable[[Moment], None]) -> None:
@@ -111,14 +111,14 @@ def watch_moments(rig: SoakRig, reach: Callable[[Moment], None]) -> None:
     last: dict[str, Any] = {}
 
     def watch_status(topic: str, moments: dict[tuple[str, str], Moment]) -> None:
-        def see(_: str, message: Any) -> None:
+        def watch(_: str, message: Any) -> None:
             before = last.get(topic)
             last[topic] = message
             for (key, value), moment in moments.items():
                 if getattr(message, key) == value != getattr(before, key, ""):
                     reach(moment)
 
-        rig.watch(topic, see)
+        rig.watch(topic, watch)
 
     def observe_hold(node: str, message: Any) -> None:
         if node != rig.hand_node:

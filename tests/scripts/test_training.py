@@ -44,10 +44,10 @@ def test_a_flat_image_is_level_and_an_edge_is_not() -> None:
         assert np.abs(normalized(np.full((120, 90), level, np.uint8))).max() < 0.01
     image = np.full((100, 100), 50, np.uint8)
     image[:, 50:] = 150
-    seen = normalized(image)
-    assert seen[50, 45] < -0.5
-    assert seen[50, 55] > 0.5
-    assert np.abs(seen).max() <= 4.0
+    inputs = normalized(image)
+    assert inputs[50, 45] < -0.5
+    assert inputs[50, 55] > 0.5
+    assert np.abs(inputs).max() <= 4.0
 
 
 @pytest.mark.parametrize("turn", range(4))
@@ -60,17 +60,17 @@ def test_ends_are_turned_with_their_images(folder: Path, turn: int, mirror: bool
     # The bar ends there, in its middle, and nowhere else.
     assert away.min() == 0.0
     assert (away < 4.0).sum() < 0.6 * math.pi * 4.0**2
-    seen = batch.seen[0, 0, CONTEXT:-CONTEXT, CONTEXT:-CONTEXT]
-    assert seen[batch.shares[0] > 0.5].mean() > seen[batch.shares[0] < 0.5].mean() + 1.0
+    inputs = batch.inputs[0, 0, CONTEXT:-CONTEXT, CONTEXT:-CONTEXT]
+    assert inputs[batch.shares[0] > 0.5].mean() > inputs[batch.shares[0] < 0.5].mean() + 1.0
 
 
 def test_a_background_that_is_not_known_is_zero(folder: Path) -> None:
     shard = read_shard(folder / "drawn-00000.npz")
     batch = batch_of([(shard, i) for i in range(_COUNT)], [0] * _COUNT, [False] * _COUNT)
     side = SIZE + 2 * CONTEXT
-    assert batch.seen.shape == (_COUNT, 2, side, side)
+    assert batch.inputs.shape == (_COUNT, 2, side, side)
     assert 0 < batch.known.sum() < _COUNT
-    np.testing.assert_array_equal(batch.seen[:, 1].any(axis=(1, 2)), batch.known)
+    np.testing.assert_array_equal(batch.inputs[:, 1].any(axis=(1, 2)), batch.known)
 
 
 def test_an_end_outside_the_patch_is_none(tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_a_pool_adds_new_files_and_drops_removed_ones(folder: Path, tmp_path: Pa
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     (tmp_path / "traced-00001.new").write_bytes(b"half of it")
     assert pool.update() == 2 * SHARD
-    assert len(pool.batch(np.random.default_rng(0), 10).seen) == 10
+    assert len(pool.batch(np.random.default_rng(0), 10).inputs) == 10
     (tmp_path / "traced-00000.npz").unlink()
     assert pool.update() == SHARD
 
@@ -168,30 +168,30 @@ def test_a_run_is_resumed_exactly_and_opencv_reads_its_net(folder: Path, tmp_pat
     assert run.step == 4
     assert other.step == 6
     # Any multiples of 4: the stored net has no fixed size.
-    seen = np.random.default_rng(0).normal(0.0, 1.0, (1, 2, 100, 148)).astype(np.float32)
+    inputs = np.random.default_rng(0).normal(0.0, 1.0, (1, 2, 100, 148)).astype(np.float32)
     with torch.no_grad():
         net = pytest.importorskip("training_net")
-        wanted = net.StoredNet(run.mean_net).eval()(torch.from_numpy(seen))
+        expected = net.StoredNet(run.mean_net).eval()(torch.from_numpy(inputs))
     stored = cv2.dnn.readNetFromONNX(str(paths[0]))
-    stored.setInput(seen)
-    for got, want in zip(stored.forward(["shaft", "end"]), wanted, strict=True):
+    stored.setInput(inputs)
+    for got, want in zip(stored.forward(["shaft", "end"]), expected, strict=True):
         np.testing.assert_allclose(got, want.numpy(), atol=1e-4)
-    assert 0.0 < float(wanted[0].min()) < float(wanted[0].max()) < 1.0
+    assert 0.0 < float(expected[0].min()) < float(expected[0].max()) < 1.0
 
 
 def test_a_net_from_stored_weights_equals_the_stored_net(tmp_path: Path) -> None:
     torch, loop = torch_and_loop()
     net = pytest.importorskip("training_net")
     path = tmp_path / "needle_net.onnx"
-    seen = torch.from_numpy(np.random.default_rng(0).normal(0.0, 1.0, (2, 2, 64, 64)))
+    inputs = torch.from_numpy(np.random.default_rng(0).normal(0.0, 1.0, (2, 2, 64, 64)))
     run = loop.new_run(5)
-    run.net(seen.float())
+    run.net(inputs.float())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         net.export(run.net, path)
     tuned = loop.new_run(0, path)
     with torch.no_grad():
-        one, other = (each.net.eval()(seen.float()) for each in (run, tuned))
+        one, other = (each.net.eval()(inputs.float()) for each in (run, tuned))
     np.testing.assert_allclose(one.numpy(), other.numpy(), atol=1e-4)
     assert tuned.rate < run.rate
 

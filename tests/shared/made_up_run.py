@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,8 +15,8 @@ from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.format.bag_metadata import USUAL_QOS
-from needle_bags.format.bag_writer import BagWriter
-from needle_core.files.bag_topic import BagTopic
+from needle_bags.format.bag_writer import BagCopy, BagWriter, standard_topic
+from needle_bags.reading.bag_messages import SentMessage, raw_as_sent, read_contents
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STEPS = 120
@@ -28,6 +29,10 @@ STEP_WALL_NS = 50_000_000
 
 def message(type_name: str, **fields: Any) -> Any:
     return STORE.types[type_name](**fields)
+
+
+def serialized(content: Any) -> bytes:
+    return bytes(STORE.serialize_cdr(content, content.__msgtype__))
 
 
 def header(nanoseconds: int, frame: str = "rig") -> Any:
@@ -54,6 +59,17 @@ def status(values: Mapping[str, object]) -> Any:
     return message("diagnostic_msgs/msg/DiagnosticStatus", level=0, values=pairs, **texts)
 
 
+def copy_messages(
+    source: Path, copy: BagCopy, change: Callable[[SentMessage], bytes | None] = lambda m: m.data
+) -> None:
+    """Copy the messages of a bag; `change` returns their data, or None to leave one out."""
+    topics = read_contents(source).topics
+    for one in raw_as_sent(source, lambda _: True):
+        data = change(one)
+        if data is not None:
+            copy.put(topics[one.topic], data, one.log_time, one.time)
+
+
 class SyntheticBag:
     def __init__(self, directory: Path, namespace: str = "/") -> None:
         self.bag = BagWriter(directory)
@@ -65,12 +81,10 @@ class SyntheticBag:
         name, kind = self.namespace + topic, content.__msgtype__
         if name not in self.channels:
             durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
-            definition = STORE.generate_msgdef(kind, ros_version=2)[0]
             qos = USUAL_QOS._replace(durability=durability)
-            described = BagTopic(name, kind, definition, STORE.hash_rihs01(kind), (qos,))
+            described = dataclasses.replace(standard_topic(name, kind), offered_qos=(qos,))
             self.channels[name] = self.bag.add_topic(described)
-        data = bytes(STORE.serialize_cdr(content, kind))
-        self.bag.write(self.channels[name], data, self.now, self.now)
+        self.bag.write(self.channels[name], serialized(content), self.now, self.now)
 
 
 def write_run(

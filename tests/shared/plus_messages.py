@@ -7,22 +7,9 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-_POLYNOMIAL, _MASK = 0x42F0E1EBA9EA3693, (1 << 64) - 1
+from needle_core.openigtlink import checksum
+
 _ASCII = 3
-_TABLE = []
-for _byte in range(256):
-    _value = _byte << 56
-    for _ in range(8):
-        _value = (_value << 1 & _MASK) ^ (_POLYNOMIAL if _value >> 63 else 0)
-    _TABLE.append(_value)
-
-
-def checksum(data: bytes) -> int:
-    """Return CRC-64 of ECMA-182."""
-    value = 0
-    for byte in data:
-        value = ((value << 8) & _MASK) ^ _TABLE[(value >> 56) ^ byte]
-    return value
 
 
 def message(kind: str, name: str, stamp: float, body: bytes, version: int = 1) -> bytes:

@@ -73,7 +73,7 @@ def with_window(rig: StereoRig, **values: Any) -> StereoRig:
     return changed(changed(rig, "left", window=window), "right", window=window)
 
 
-def seen(camera: SimulatedCamera, points: Array, under: bool) -> Array:
+def pixels_of(camera: SimulatedCamera, points: Array, under: bool) -> Array:
     """Return the pixels of points in rig; `under`: through the window."""
     if under:
         return project(points, camera)
@@ -96,7 +96,7 @@ def view_of(
     points, found = board.corners, []
     for camera in (rig.left, rig.right):
         moved = points @ pose[:3, :3].T + pose[:3, 3]
-        pixels = seen(camera, moved, place is not None and place.under_surface)
+        pixels = pixels_of(camera, moved, place is not None and place.under_surface)
         pixels = pixels + rng.normal(0.0, noise, pixels.shape)
         end = np.array([camera.image_width, camera.image_height]) - 5
         inside = np.all((pixels > 5) & (pixels < end), axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -64,8 +65,13 @@ class Scene:
             if self.states[-1].pressed:
                 return
 
-    def ends(self, hold: Callable[[], None], act: Callable[[], object]) -> None:
-        """Check that an act ends a hold; repeat if a busy machine lost the hold before."""
+    def ends(
+        self, hold: Callable[[], None], act: Callable[[], object], why: str | None = None
+    ) -> None:
+        """Check that an act ends a hold; repeat if a busy machine lost the hold before.
+
+        The reason on the page must be `why`, if given.
+        """
         deadline = time.monotonic() + PATIENCE
         while True:
             assert time.monotonic() < deadline, "holds end by themselves alone"
@@ -74,17 +80,23 @@ class Scene:
             act()
             self.until_released()
             if self._counts().get("hold lost", 0) == lost:
+                assert why is None or self.why == why
                 return
+
+    @property
+    def why(self) -> str:
+        """Reason that the page gives for the end of the last hold."""
+        return str(self.tab.run("needleHold.status.why"))
 
     def never_pressed(self, press: Callable[[], None]) -> bool:
         """Press, and return whether the hold counts."""
         self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
-        seen = len(self.states)
+        before = len(self.states)
         press()
         # The browser has processed the event when it answers.
         self.tab.run("0")
         self.let_pass(15)
-        return not any(state.pressed for state in self.states[seen:])
+        return not any(state.pressed for state in self.states[before:])
 
     def hold_pointer(self) -> None:
         self.hold(
@@ -113,18 +125,24 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
 
 def test_mouse_space_bar_and_finger_hold_until_released(scene: Scene) -> None:
     tab = scene.tab
-    scene.ends(scene.hold_pointer, lambda: tab.release_pointer(*BUTTON))
-    scene.ends(scene.hold_space, tab.release_space)
-    scene.ends(scene.hold_touch, tab.touch)
+    scene.ends(scene.hold_pointer, lambda: tab.release_pointer(*BUTTON), "")
+    scene.ends(scene.hold_space, tab.release_space, "")
+    scene.ends(scene.hold_touch, tab.touch, "")
 
 
 def test_a_second_finger_or_button_or_key_ends_a_hold(scene: Scene) -> None:
     tab = scene.tab
-    scene.ends(scene.hold_touch, lambda: tab.touch(BUTTON, ELSEWHERE))
+    second, elsewhere = "a second finger or mouse button", "the browser took the pointer away"
+    scene.ends(scene.hold_touch, lambda: tab.touch(BUTTON, ELSEWHERE), f"hold ended: {second}")
     tab.touch()
-    scene.ends(scene.hold_touch, tab.cancel_touch)
-    scene.ends(scene.hold_pointer, lambda: tab.press_other_button(*BUTTON))
-    scene.ends(scene.hold_space, lambda: tab.press_key("Escape"))
+    scene.ends(scene.hold_touch, tab.cancel_touch, f"hold ended: {elsewhere}")
+    press = partial(tab.press_other_button, *BUTTON)
+    scene.ends(scene.hold_pointer, press, f"hold ended: {second}")
+    press = partial(tab.press_key, "Escape")
+    scene.ends(scene.hold_space, press, "hold ended: another key was pressed")
+    focus = partial(tab.run, "window.frames[0].focus()")
+    scene.ends(scene.hold_pointer, focus, "hold ended: the window lost focus")
+    tab.run("window.focus()")
 
 
 def test_a_removed_button_or_page_ends_its_hold(scene: Scene) -> None:
@@ -144,34 +162,15 @@ def test_a_removed_button_or_page_ends_its_hold(scene: Scene) -> None:
     scene.tab.release_space()
 
 
-def test_the_page_gives_the_reason_of_an_ended_hold(scene: Scene) -> None:
+def test_a_stalled_page_says_so_until_the_next_press(scene: Scene) -> None:
     tab = scene.tab
-
-    def why() -> str:
-        return str(tab.run("needleHold.status.why"))
-
-    def stand_still() -> None:
-        tab.run("const end = performance.now() + 500; while (performance.now() < end);")
-
-    scene.ends(scene.hold_pointer, lambda: tab.release_pointer(*BUTTON))
-    assert why() == ""
-    scene.ends(scene.hold_pointer, lambda: tab.press_other_button(*BUTTON))
-    assert why() == "hold ended: a second finger or mouse button"
-    scene.ends(scene.hold_space, lambda: tab.press_key("Escape"))
-    assert why() == "hold ended: another key was pressed"
-    scene.ends(scene.hold_touch, tab.cancel_touch)
-    assert why() == "hold ended: the browser took the pointer away"
-    scene.ends(scene.hold_pointer, lambda: tab.run("window.frames[0].focus()"))
-    assert why() == "hold ended: the window lost focus"
-    tab.run("window.focus()")
     scene.hold_pointer()
-    stand_still()
+    tab.run("const end = performance.now() + 500; while (performance.now() < end);")
     stalled = "hold ended: no echo from this page for 0.25 s (browser, network or console stalled)"
-    scene.until(lambda: why() == stalled, "it says why")
+    scene.until(lambda: scene.why == stalled, "it says why")
     assert tab.run(_STATE) == "again"
-    # It disappears with the next press.
     scene.hold_pointer()
-    assert why() == ""
+    assert scene.why == ""
     tab.release_pointer(*BUTTON)
     scene.until_released()
 

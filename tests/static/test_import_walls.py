@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from grimp import ImportGraph
 
-from import_walls import RosRoomContract
+from import_walls import RosFolderContract
 
 CONFIGURATION = Path(__file__).parents[2] / "pyproject.toml"
 
@@ -19,7 +19,7 @@ def broken(importer: str, imported: str) -> list[str]:
         graph.add_module(module, is_squashed="." not in module)
     graph.add_import(importer=importer, imported=imported, line_number=1, line_contents="")
     options: dict[str, Any] = {"packages": ["needle_sim", "needle_core"]}
-    contract = RosRoomContract(name="wall", session_options={}, contract_options=options)
+    contract = RosFolderContract(name="wall", session_options={}, contract_options=options)
     found: list[str] = contract.check(graph, verbose=False).metadata["broken"]
     return found
 
@@ -56,7 +56,7 @@ def test_other_imports_are_allowed(importer: str, imported: str) -> None:
     assert broken(importer, imported) == []
 
 
-def test_every_package_is_behind_the_walls() -> None:
+def test_every_package_has_its_contracts() -> None:
     sources = CONFIGURATION.parent / "ros2_ws" / "src"
     text = CONFIGURATION.read_text("utf-8")
     for package in sources.glob("*/package.xml"):

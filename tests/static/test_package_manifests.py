@@ -61,7 +61,7 @@ def imports_of(folder: Path) -> set[str]:
 def test_a_manifest_names_what_the_package_imports(manifest: Path) -> None:
     root = ElementTree.parse(manifest).getroot()
     imported = imports_of(manifest.parent / manifest.parent.name) - FROM_THE_LOCK_ALONE
-    wanted = {ROSDEP_KEYS.get(name, name) for name in imported}
+    required = {ROSDEP_KEYS.get(name, name) for name in imported}
     named = {element.text for element in root.iter("exec_depend")}
-    assert wanted - named == set()
-    assert not {name for name in named - wanted if name and name.startswith("python3-")}
+    assert required - named == set()
+    assert not {name for name in named - required if name and name.startswith("python3-")}

@@ -117,7 +117,7 @@ def draw(folder: Path, depth: float) -> None:
         return sensors[0]
 
     hold = lambda seconds: Held(pressed=seconds > 0.2)  # noqa: E731
-    steer(hold, 1, latency=0.01, see=make_sensor, depth=depth, nominal_speed=SPEED)
+    steer(hold, 1, latency=0.01, new_sensor=make_sensor, depth=depth, nominal_speed=SPEED)
     np.save(folder / _IMAGES_FILE, np.array(sensors[0].images))
     np.save(folder / _INSERTIONS_FILE, np.array(sensors[0].insertions))
 
@@ -237,8 +237,8 @@ class LatencyRig(RosRigClient):
             image.publish(self._converter.to_ros(image_message(pixels, frame, exposed_ns)))
         self.published += 1
 
-    def _on_places(self, message: JointState, info: dict[str, int]) -> None:
-        super()._on_places(message, info)
+    def _on_joints(self, message: JointState, info: dict[str, int]) -> None:
+        super()._on_joints(message, info)
         self._joints.append((to_nanoseconds(message.header.stamp), message.position[0]))
 
 

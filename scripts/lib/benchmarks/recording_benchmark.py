@@ -47,9 +47,9 @@ def writer_rows() -> Iterator[Row]:
                 yield 2, time_ns, small
 
     size = sum(len(data) for _, _, data in messages()) / 1e6
-    ways = (_record, _write_rosbags, _write_plainly)
+    writers = (_record, _write_rosbags, _write_plainly)
     # The writers take turns, so that other load on the machine affects all of them.
-    seconds = [[_timed(way, messages) for way in ways] for _ in range(3)]
+    seconds = [[_timed(write, messages) for write in writers] for _ in range(3)]
     recorder, rosbags, disk = (min(times) for times in zip(*seconds, strict=True))
     what = f"recorder's writer, {size:.0f} MB"
     yield Row("recording", what, "s", recorder, "rosbags Writer", rosbags)

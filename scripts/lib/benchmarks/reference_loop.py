@@ -100,12 +100,12 @@ def law_turn(s: Linear, design: Design) -> float:
     """Return the rotation of the base over the next step [rad]."""
     length = design.step
     v = -sum(gain * value for gain, value in zip(design.feedback, s, strict=True))
-    wanted = (s[0], s[1] + length * s[2] + 0.5 * length**2 * v, s[2] + length * v)
-    wanted = saturate(wanted, design, design.demand_margin)
+    demanded = (s[0], s[1] + length * s[2] + 0.5 * length**2 * v, s[2] + length * v)
+    demanded = saturate(demanded, design, design.demand_margin)
     roll = roll_of(s, design)
     drift = -design.curvature * math.cos(roll) * math.tan(math.asin(s[1])) * length
     limit = design.max_rotation * length
-    return min(max(roll_of(wanted, design) - roll - drift, -limit), limit)
+    return min(max(roll_of(demanded, design) - roll - drift, -limit), limit)
 
 
 def steer(start: Sequence[float], noise: Sequence[float], design: Design) -> float:

@@ -7,7 +7,7 @@ import ast
 from reference.endpoints import SOURCES
 from reference.markdown import table
 
-ROOMS = (
+LIBRARIES = (
     "needle_controller.model",
     "needle_controller.observers",
     "needle_controller.filter",
@@ -28,17 +28,17 @@ def api_pages() -> dict[str, str]:
     """Return an index and one page for each package, by file name."""
     rows = []
     found = {}
-    for room in ROOMS:
-        package, _, name = room.partition(".")
+    for library in LIBRARIES:
+        package, _, name = library.partition(".")
         folder = SOURCES / package / package / name
         said = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or ""
-        rows.append((f"[`{room}`](api/{room}.md)", said.partition("\n\n")[0]))
+        rows.append((f"[`{library}`](api/{library}.md)", said.partition("\n\n")[0]))
         modules = [path.stem for path in sorted(folder.glob("*.py")) if path.stem != "__init__"]
-        found[f"api/{room}.md"] = "\n\n".join(
+        found[f"api/{library}.md"] = "\n\n".join(
             (
-                f"# {room}",
+                f"# {library}",
                 said,
-                *(_automodule(room, module) for module in modules),
+                *(_automodule(library, module) for module in modules),
             )
         )
     index = (
@@ -48,6 +48,6 @@ def api_pages() -> dict[str, str]:
     return {"api.md": index, **found}
 
 
-def _automodule(room: str, module: str) -> str:
-    lines = (f".. automodule:: {room}.{module}", "   :members:")
+def _automodule(library: str, module: str) -> str:
+    lines = (f".. automodule:: {library}.{module}", "   :members:")
     return "\n".join((f"## {module}", "", "```{eval-rst}", *lines, "```"))

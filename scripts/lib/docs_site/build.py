@@ -43,7 +43,7 @@ def build(out: Path) -> bool:
 
     from docs_site.api_pages import api_pages  # noqa: PLC0415
     from docs_site.source_tree import write_tree  # noqa: PLC0415
-    from reference.write import pages  # noqa: PLC0415
+    from reference.pages import pages  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as scratch:
         source, trees = Path(scratch, "source"), Path(scratch, "trees")

@@ -194,12 +194,12 @@ def _exercise(node: Any) -> None:
 
 def _exercise_console(node: Any) -> None:
     """Press every button of the page."""
-    desk = node._ports[PAGE]
-    desk.view("left")
+    page = node._ports[PAGE]
+    page.view("left")
     for button in Button:
         if button in CALLS:
-            desk.press(button)
-    desk.set_hold(PageHold(True, 1.0, Mode.RETRACT))
+            page.press(button)
+    page.set_hold(PageHold(True, 1.0, Mode.RETRACT))
     node._handle_arrived()
     for timer in node.component.timers:
         node._handle(lambda timer=timer: timer.handler(node._moment()))

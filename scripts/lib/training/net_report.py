@@ -108,15 +108,15 @@ def end_error(intensity: Array, share: Array, end: Array) -> EndError | None:
         True end, column and row [px].
     """
     rows, columns = np.indices(intensity.shape)
-    places = np.stack([columns, rows], axis=-1)
-    away = np.hypot(*np.moveaxis(places - end, -1, 0))
+    pixels = np.stack([columns, rows], axis=-1)
+    away = np.hypot(*np.moveaxis(pixels - end, -1, 0))
     if intensity[away <= _NEAR_PX].sum() <= _SEEN:
         return None
     shaft = (share > 0.5) & (away < _SHAFT_PX)
-    ahead = end - places[shaft].mean(axis=0) if shaft.any() else np.array([1.0, 0.0])
+    ahead = end - pixels[shaft].mean(axis=0) if shaft.any() else np.array([1.0, 0.0])
     ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
     near = away <= _AROUND_PX
-    weights, around = intensity[near], places[near].astype(np.float64)
+    weights, around = intensity[near], pixels[near].astype(np.float64)
     centre = weights @ around / weights.sum()
     spread = (weights * (around - centre).T) @ (around - centre) / weights.sum()
     error = centre - end
@@ -135,7 +135,7 @@ def report(net: NeedleNet, shards: Iterable[Shard]) -> str:
             with torch.no_grad():
                 shaft, log_intensity = (
                     each.numpy()[:, 0, CONTEXT:-CONTEXT, CONTEXT:-CONTEXT].astype(np.float64)
-                    for each in stored(torch.from_numpy(batch.seen))
+                    for each in stored(torch.from_numpy(batch.inputs))
                 )
             for k in range(_AT_ONCE):
                 width = int(np.searchsorted(WIDTHS_PX[1:-1], batch.widths_px[k]))
@@ -158,8 +158,8 @@ def _count(figures: Figures, shaft: Array, log_intensity: Array, share: Array, e
     figures.end_loss += float(intensity.sum())
     if np.isfinite(end).all():
         figures.ends += 1
-        place = np.asarray([[end]], np.float32)
-        at_end = cv2.remap(intensity, place, None, cv2.INTER_LINEAR)
+        pixel = np.asarray([[end]], np.float32)
+        at_end = cv2.remap(intensity, pixel, None, cv2.INTER_LINEAR)
         figures.end_loss -= float(np.log(max(float(np.ravel(at_end)[0]), 1e-9)))
         error = end_error(intensity, share, end)
         if error is not None:
@@ -183,7 +183,7 @@ def report_views(net: NeedleNet, scenes: Iterable[TracedScene]) -> str:
         path = Path(folder, "needle_net.onnx")
         export(net, path)
         detector = needle_net.NeedleNet(path.read_bytes())
-    seen, wrong, false = np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
+    found_ends, wrong, false = np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
     for number, scene in enumerate(scenes):
         for i in range(len(scene.images)):
             for known in (False, True):
@@ -200,13 +200,13 @@ def report_views(net: NeedleNet, scenes: Iterable[TracedScene]) -> str:
                     false[int(known)] += [1, len(found)]
                 elif np.isfinite(scene.ends[i]).all():
                     away = np.hypot(*(found - scene.ends[i]).T)
-                    seen[int(known)] += [1, (away < _AROUND_PX).any()]
+                    found_ends[int(known)] += [1, (away < _AROUND_PX).any()]
                     wrong[int(known)] += (away >= _AROUND_PX).sum()
     lines = ["background  ends  seen  others/image  empty  false/image"]
     for row, name in enumerate(("no", "yes")):
-        ends, empty = seen[row, 0], false[row, 0]
+        ends, empty = found_ends[row, 0], false[row, 0]
         lines.append(
-            f"{name:10s}  {ends:4.0f} {seen[row, 1] / max(ends, 1):5.1%}  "
+            f"{name:10s}  {ends:4.0f} {found_ends[row, 1] / max(ends, 1):5.1%}  "
             f"{wrong[row] / max(ends, 1):8.2f}  {empty:9.0f} {false[row, 1] / max(empty, 1):8.2f}"
         )
     return "\n".join(lines)

@@ -56,7 +56,7 @@ class Batch:
 
     Attributes
     ----------
-    seen : ndarray of float32, shape (n, 2, SIZE + 2 CONTEXT, SIZE + 2 CONTEXT)
+    inputs : ndarray of float32, shape (n, 2, SIZE + 2 CONTEXT, SIZE + 2 CONTEXT)
         Images and backgrounds, normalized.
     shares : ndarray of float32, shape (n, SIZE, SIZE)
         Share of the shaft in each pixel, 0 to 1.
@@ -68,7 +68,7 @@ class Batch:
         Whether there is a background.
     """
 
-    seen: Float
+    inputs: Float
     shares: Float
     ends: Float
     widths_px: NDArray[np.float64]
@@ -163,7 +163,7 @@ def batch_of(chosen: list[tuple[Shard, int]], turns: list[int], mirrors: list[bo
         Whether each sample is mirrored after that.
     """
     side = SIZE + 2 * CONTEXT
-    seen = np.zeros((len(chosen), 2, side, side), np.float32)
+    inputs = np.zeros((len(chosen), 2, side, side), np.float32)
     shares = np.empty((len(chosen), SIZE, SIZE), np.float32)
     ends = np.full((len(chosen), 2), np.nan, np.float32)
     inner, shown = slice(BORDER, -BORDER), slice(_OUTSIDE, -_OUTSIDE)
@@ -171,13 +171,13 @@ def batch_of(chosen: list[tuple[Shard, int]], turns: list[int], mirrors: list[bo
         flip = -1 if mirror else 1
         images = [shard.images[i]] + [shard.backgrounds[i]] * bool(shard.known[i])
         for channel, image in enumerate(images):
-            seen[k, channel] = np.rot90(normalized(image)[shown, shown], turn)[::flip]
+            inputs[k, channel] = np.rot90(normalized(image)[shown, shown], turn)[::flip]
         shares[k] = np.rot90(shard.shares[i][inner, inner], turn)[::flip]
         ends[k] = _turned(shard.ends[i] - BORDER, turn, mirror)
     outside = ~((ends >= 0.0) & (ends <= SIZE - 1.0)).all(axis=1)
     ends[outside] = np.nan
     return Batch(
-        seen,
+        inputs,
         shares / np.float32(255.0),
         ends,
         np.array([shard.widths_px[i] for shard, i in chosen]),

@@ -192,9 +192,9 @@ def end_loss(log_intensity: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
 
 def losses(net: NeedleNet, batch: Batch, *, rounded: bool) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the losses of shaft and ends, if `rounded` with bfloat16, which may be faster."""
-    seen = torch.from_numpy(batch.seen).to(memory_format=torch.channels_last)
+    inputs = torch.from_numpy(batch.inputs).to(memory_format=torch.channels_last)
     with torch.autocast("cpu", torch.bfloat16, enabled=rounded):
-        out = net(seen)
+        out = net(inputs)
     out = out.float()[:, :, CONTEXT:-CONTEXT, CONTEXT:-CONTEXT]
     return (
         shaft_loss(out[:, 0], torch.from_numpy(batch.shares)),

@@ -71,10 +71,10 @@ class NeedleNet(nn.Module):
             Logit of the shaft, and logarithm of the intensity of ends.
         """
         half = functional.relu(self.first(image))
-        seen = functional.relu(self.second(half))
+        features = functional.relu(self.second(half))
         for layer in self.trunk:
-            seen = seen + functional.relu(layer(seen))
-        half = half + twice_as_large(self.up_middle(seen))
+            features = features + functional.relu(layer(features))
+        half = half + twice_as_large(self.up_middle(features))
         half = half + functional.relu(self.middle(half))
         wide = functional.relu(twice_as_large(self.up_full(half)))
         fine = functional.relu(self.fine(image))

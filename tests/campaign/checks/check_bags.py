@@ -21,19 +21,19 @@ LONGEST_END, LONGEST_END_OF_OTHERS = {"recorder": 10.0}, 5.0
 
 def full_rate(bench: Workbench) -> Iterator[Finding]:
     """Record stereo at 2 x 30 Hz with all other topics while both cores are busy."""
-    seen = record_full_rate(bench.folder, DURATION)
-    missing, counted = seen["missing"], seen["counted"]
+    measured = record_full_rate(bench.folder, DURATION)
+    missing, counted = measured["missing"], measured["counted"]
     yield Finding(
         "full_rate_missing",
-        f"{seen['sent']} messages in {DURATION:.0f} s, both cores busy: missing, of which counted",
+        f"{measured['sent']} messages in {DURATION:.0f} s, both cores busy: missing, counted",
         "0, counted at the source, and just those that the recorder counts",
-        f"{missing or 0}, {counted or 0} ({seen['MB_per_s']:.0f} MB/s)",
-        not missing and not counted and seen["code"] == 0,
+        f"{missing or 0}, {counted or 0} ({measured['MB_per_s']:.0f} MB/s)",
+        not missing and not counted and measured["code"] == 0,
     )
     what = "the recorder's processor time, of a core"
-    yield at_most("full_rate_processor", what, PROCESSOR_SHARE, seen["share"], form=".1%")
-    what = f"growth of the recorder's memory ({seen['memory']:.0f} MB) in the second half"
-    yield at_most("full_rate_memory", what, MEMORY_GROWTH_MB, seen["grew"], " MB")
+    yield at_most("full_rate_processor", what, PROCESSOR_SHARE, measured["share"], form=".1%")
+    what = f"growth of the recorder's memory ({measured['memory']:.0f} MB) in the second half"
+    yield at_most("full_rate_memory", what, MEMORY_GROWTH_MB, measured["grew"], " MB")
     why = bag_read_error(bench.folder / "full_rate")
     yield Finding("full_rate_readers", "rosbags and mcap", "read all", why or "read all", not why)
 

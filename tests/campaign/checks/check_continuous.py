@@ -28,8 +28,8 @@ def hands(_: Workbench) -> Iterator[Finding]:
         errors, done = [], 0
         for seed in range(SEED, SEED + NEEDLES):
             hand = new_hand(np.random.default_rng(seed))
-            state, way = steer(hand, seed, pushed=name.startswith("pushed"))
-            errors.append(rms_at_end(way) * 1e3)
+            state, path = steer(hand, seed, pushed=name.startswith("pushed"))
+            errors.append(rms_at_end(path) * 1e3)
             done += state == "DONE"
         rms = math.sqrt(float(np.mean(np.square(errors))))
         yield Finding(
@@ -49,8 +49,8 @@ def frame_rates(bench: Workbench) -> Iterator[Finding]:
         for delay in ("0", "0.05", "0.17", "0.5")
     }
     stepwise = figures.pop("0")["rms_last_20_mm"]
-    for delay, seen in figures.items():
-        rms, there = seen["rms_last_20_mm"], seen["converged_at_end"]
+    for delay, figure in figures.items():
+        rms, there = figure["rms_last_20_mm"], figure["converged_at_end"]
         yield Finding(
             f"continuous_turn_delay_{delay}",
             f"10,000 needles, turned {delay} mm after each used tip",

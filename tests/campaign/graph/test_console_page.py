@@ -132,7 +132,7 @@ def check_stands_still(page: Page) -> float:
     return at
 
 
-def hold_until(page: Page, press: Hand, let_go: Hand, wanted: str) -> None:
+def hold_until(page: Page, press: Hand, let_go: Hand, headline: str) -> None:
     """Hold until the depth [mm] meets the condition, without a release.
 
     A browser that is delayed by 0.25 s on a busy machine loses the hold; the test then releases and
@@ -141,7 +141,7 @@ def hold_until(page: Page, press: Hand, let_go: Hand, wanted: str) -> None:
     for _ in range(int(LIMIT)):
         press()
         try:
-            page.wait_for_function(f"() => ({DEPTH})() {wanted}", timeout=2e3)
+            page.wait_for_function(f"() => ({DEPTH})() {headline}", timeout=2e3)
         except TooLate:
             let_go()
         else:
@@ -153,14 +153,14 @@ def make_ready(page: Page) -> None:
     """Press the buttons in the advised order."""
     # Services answer only after simulated time has started.
     expect(reading(page, "Depth")).to_have_text("0.0 mm of 120 mm")
-    for button, wanted in (
+    for button, headline in (
         ("Confirm needle out", "Not homed"),
         ("Home", "Ready, switched off"),
         ("Enable", "Ready to steer"),
         ("Start steering", "Steering waits for you"),
     ):
         press(page, button)
-        expect(page.locator(".headline")).to_have_text(wanted)
+        expect(page.locator(".headline")).to_have_text(headline)
 
 
 def test_a_needle_is_steered_by_the_space_bar_and_stops_with_it(page: Page) -> None:

@@ -151,30 +151,30 @@ def test_a_kill_releases_the_name_of_a_process() -> None:
         Claim(name, "/second").release()
 
 
-class Desk:
+class WorkerState:
     """State that is prepared in the worker."""
 
-    lies_there: ClassVar[str] = ""
+    content: ClassVar[str] = ""
 
     @staticmethod
-    def put(what: str) -> None:
-        Desk.lies_there = what
+    def put(content: str) -> None:
+        WorkerState.content = content
 
     @staticmethod
-    def tell() -> tuple[int, str]:
-        return os.getpid(), Desk.lies_there
+    def report() -> tuple[int, str]:
+        return os.getpid(), WorkerState.content
 
 
 @pytest.mark.parametrize("number", ENDING_SIGNALS)
 def test_a_signal_ends_no_worker_and_is_not_blocked_in_the_parent(number: signal.Signals) -> None:
-    with start_worker(Desk.put, "images") as worker:
-        process, there = worker.submit(Desk.tell).result()
-        assert there == "images"
+    with start_worker(WorkerState.put, "images") as worker:
+        process, content = worker.submit(WorkerState.report).result()
+        assert content == "images"
         assert process != os.getpid()
         os.kill(process, number)
-        assert worker.submit(Desk.tell).result() == (process, "images")
+        assert worker.submit(WorkerState.report).result() == (process, "images")
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(ENDING_SIGNALS)
-    assert Desk.lies_there == ""
+    assert WorkerState.content == ""
 
 
 REMAPPINGS = {

@@ -140,7 +140,7 @@ def test_another_computer_neither_discovers_nor_stops_a_closed_rig(
             text=True,
             check=True,
         )
-    seen = json.loads(asked.stdout)
-    assert seen["heard"] == {"open": "ESTOPPED", "closed": ""}
-    assert set(seen["found"]) == {"/open"}
+    reached = json.loads(asked.stdout)
+    assert reached["heard"] == {"open": "ESTOPPED", "closed": ""}
+    assert set(reached["found"]) == {"/open"}
     assert "emergency stop" not in closed.log.read_text("utf-8")

@@ -16,6 +16,8 @@ LARGEST_CURVATURE_SHARE = 0.85
 MOST_OBSTACLES = 6
 SMALLEST, LARGEST = 0.003, 0.010
 """Radius of an obstacle [m]."""
+PITCH_BOUND, ROLL_BOUND = math.radians(1.0), math.radians(10.0)
+"""Bounds of the uniform pitch and roll at the entry [rad]."""
 _ASIDE = 0.012
 """Largest distance of its centre from the straight line, in x and y [m]."""
 _FREE_BELOW, _FREE_AROUND = 0.012, 0.004
@@ -43,9 +45,7 @@ class ObstacleScene:
     roll: float
 
 
-def make_scene(
-    seed: int, number: int, *, curvature: float, pitch_bound: float, roll_bound: float
-) -> ObstacleScene:
+def make_scene(seed: int, number: int, curvature: float) -> ObstacleScene:
     """Return a scene, which may have no path to the target.
 
     Parameters
@@ -54,8 +54,6 @@ def make_scene(
         Keys of the random numbers.
     curvature : float
         Curvature of the needle's path [1/m].
-    pitch_bound, roll_bound : float
-        Bounds of the uniform pitch and roll at the entry [rad].
     """
     rng = np.random.default_rng([seed, number])
     length = rng.uniform(NEAREST, FARTHEST)
@@ -74,7 +72,7 @@ def make_scene(
             ):
                 rows.append(row)
                 break
-    pitch, roll = rng.uniform(-1.0, 1.0, 2) * [pitch_bound, roll_bound]
+    pitch, roll = rng.uniform(-1.0, 1.0, 2) * [PITCH_BOUND, ROLL_BOUND]
     return ObstacleScene(target, np.array(rows).reshape(-1, 7), float(pitch), float(roll))
 
 

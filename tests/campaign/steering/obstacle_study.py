@@ -16,7 +16,6 @@ import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, clearance, make_scene
 from campaign.steering.path_search import find_path
-from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import next_step
@@ -32,14 +31,14 @@ CURVATURE = SteeringSettings.curvature
 SAMPLES = 4000
 """Random points of the search for a path."""
 DEPTH = 0.2
+ENTRY_ANGLE_STD = math.radians(2.0)
+"""Standard deviation of the pitch at the entry that the controller assumes [rad]."""
 _SUBSTEPS = 4
-Drive = Callable[[FloatArray, JointSample], SteeringCommand | None]
-"""Function from a tip and its joints to a command; None if there is no path."""
 LABELS = {
     "scenes": "scenes",
     "solvable": "solvable with 90 % of the curvature, 0.75 mm clear",
     "solvable_reached": "  reached within 1 mm, of those solvable",
-    "unsolvable": "no way found with all the curvature, 0.35 mm clear",
+    "unsolvable": "no path found with all the curvature, 0.35 mm clear",
     "unsolvable_refused": "  refused before insertion, of those",
     "contacts": "needles that touched an obstacle",
     "update_p95_ms": "estimate, plan and law, 95 % [ms of one core]",
@@ -108,8 +107,11 @@ def steer(
     times : list of float
         List to which the CPU time of each update is appended [s].
     """
-    drive = _start_controller(scene, settings)
-    if drive is None:
+    obstacles = tuple(float(value) for value in scene.obstacles.ravel())
+    control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
+    control.target_point = scene.target
+    if control.path_problem(0.0):
+        # The node would not start.
         return solved
     plant = NeedlePlant(initial_pose(scene.pitch, scene.roll), curvature=CURVATURE)
     noise = settings.tip_noise_bound
@@ -117,11 +119,11 @@ def steer(
     for k in itertools.count(1):
         tip = _tip(plant) + rng.uniform(-noise, noise, 3)
         begin = time.thread_time()
-        command = drive(tip, joints)
+        update = control.update(tip, joints)
         times.append(time.thread_time() - begin)
         step = None
-        if command is not None:
-            step = next_step(k, joints, command, settings, slowly=False)
+        if update.command is not None and not update.blocked:
+            step = next_step(k, joints, update.command, settings, slowly=False)
         if step is None:
             miss = float(np.linalg.norm(_tip(plant) - scene.target))
             return dataclasses.replace(solved, taken=True, miss=miss, least=least)
@@ -133,46 +135,19 @@ def steer(
     raise AssertionError
 
 
-def _start_controller(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
-    """Return a function that steers a needle as the node does; None if the node would not start."""
-    obstacles = tuple(float(value) for value in scene.obstacles.ravel())
-    control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
-    control.target_point = scene.target
-    if control.path_problem(0.0):
-        return None
-
-    def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand | None:
-        update = control.update(tip, joints)
-        return None if update.blocked else update.command
-
-    return drive
-
-
-def study(
-    scenes: int,
-    seed: int,
-    *,
-    pitch_bound: float,
-    roll_bound: float,
-    entry_angle_std: float,
-    noise: float,
-) -> dict[str, float | None]:
+def study(scenes: int, seed: int, noise: float) -> dict[str, float | None]:
     """Return the figures of some scenes, by the names of `LABELS`.
 
     Parameters
     ----------
     scenes, seed : int
         Number of scenes, and seed of all random numbers.
-    pitch_bound, roll_bound : float
-        Bounds of the needles' angles at their entries [rad].
-    entry_angle_std : float
-        Standard deviation of these angles that the controller assumes [rad].
     noise : float
         Largest error of a measured coordinate, which the controller assumes, too [m].
     """
     settings = SteeringSettings(
         depth=DEPTH,
-        entry_angle_std=entry_angle_std,
+        entry_angle_std=ENTRY_ANGLE_STD,
         tip_covariance="configured",
         tip_noise="bounded",
         tip_noise_bound=noise,
@@ -181,9 +156,7 @@ def study(
     outcomes: list[SceneOutcome] = []
     times: list[float] = []
     for n in range(scenes):
-        scene = make_scene(
-            seed, n, curvature=CURVATURE, pitch_bound=pitch_bound, roll_bound=roll_bound
-        )
+        scene = make_scene(seed, n, CURVATURE)
         rng = np.random.default_rng([seed, n, 1])
         outcomes.append(steer(scene, solvability(scene, settings), settings, rng, times))
     return figures(outcomes, times)
@@ -223,35 +196,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: Sequence[str]) -> int:
-    options = (
-        ("--scenes", "1000", "N", "number of scenes"),
-        ("--seed", "1", "N", "seed of all random numbers"),
-        ("--pitch-deg", "1", "P", "bound of the pitch at the entry"),
-        ("--roll-deg", "10", "R", "bound of the roll at the entry"),
-        ("--told-deg", "2", "S", "standard deviation of the pitch that the controller assumes"),
-        ("--noise-mm", "1", "A", "maximum error of each coordinate, known to the controller"),
-    )
     parser = CommandParser("obstacle_study", "Steer needles around generated obstacles.", "")
-    for option, default, metavar, text in options:
-        parser.add_argument(
-            option, default=default, metavar=metavar, help=f"{text} (default: {default})"
-        )
-    parser.add_argument("--json", metavar="FILE", help="also write the figures as flat JSON")
+    add = parser.add_argument
+    add("--scenes", default="1000", metavar="N", help="number of scenes (1000)")
+    add("--seed", default="1", metavar="N", help="seed of all random numbers (1)")
+    add("--noise-mm", default="1", metavar="A", help="maximum error of each coordinate (1)")
+    add("--json", metavar="FILE", help="also write the figures as flat JSON")
     given = parser.parse_args(words)
     path = output_file("--json", given.json)
-    seen = study(
+    result = study(
         whole_number("--scenes", given.scenes, 1, 100_000),
         whole_number("--seed", given.seed, 0, 2**31 - 1),
-        pitch_bound=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 20.0, "deg")),
-        roll_bound=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
-        entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),
-        noise=number("--noise-mm", given.noise_mm, 0.01, 10.0, "mm") * 1e-3,
+        number("--noise-mm", given.noise_mm, 0.01, 10.0, "mm") * 1e-3,
     )
     for name, label in LABELS.items():
-        value = seen[name]
+        value = result[name]
         print(f"{label:55s}", "-" if value is None else f"{value:.4g}")
     if path is not None:
-        write_json(path, {**seen})
+        write_json(path, {**result})
     return EXIT_DONE
 
 

@@ -23,7 +23,7 @@ from needle_controller.model.arrays import Array
 from needle_core.commands.cli import EXIT_DONE, run_command
 from needle_core.errors import UserError
 
-SEEN, AHEAD = 0.050, 0.098
+GIVEN, AHEAD = 0.050, 0.098
 """Largest depth of the given tips, and depth of the forecast [m]."""
 _NEAR = 0.004
 _COLUMNS = ("Tip x", "Tip y", "Tip z", "Tip sec", "Tip nanosec")
@@ -51,7 +51,7 @@ def tips_of(path: Path) -> Array:
     return np.column_stack([across - np.mean(across[:3], axis=0), -y[inside]])
 
 
-def place_at(tips: Array, depth: float) -> Array | None:
+def position_at(tips: Array, depth: float) -> Array | None:
     """Return the position at a depth, (2,) [m], by a line through the nearby tips, or None."""
     near = np.abs(tips[:, 2] - depth) < _NEAR
     if np.sum(near) < 3 or np.max(tips[:, 2]) < depth - 0.0015:
@@ -70,13 +70,13 @@ def compare(tips: Array, truth: Array) -> tuple[float, float, bool]:
     truth : ndarray, shape (2,)
         Position at the depth of the forecast [m].
     """
-    seen = tips[tips[:, 2] <= SEEN]
-    checked = fit_checked(seen, None, CurvatureFitSettings(repeating_error=2e-5))
-    ahead = forecast_tip(seen, False, checked, AHEAD)
+    given = tips[tips[:, 2] <= GIVEN]
+    checked = fit_checked(given, None, CurvatureFitSettings(repeating_error=2e-5))
+    ahead = forecast_tip(given, False, checked, AHEAD)
     # The forecast is for a length of path, the truth for a depth.
     slope = ahead.tip[:2] / ahead.tip[2]
     off = ahead.tip[:2] + slope * (AHEAD - ahead.tip[2]) - truth
-    parabola = np.polyfit(seen[:, 2], seen[:, :2], 2)
+    parabola = np.polyfit(given[:, 2], given[:, :2], 2)
     plain = parabola[0] * AHEAD**2 + parabola[1] * AHEAD + parabola[2] - truth
     inside = bool(np.all(np.abs(off) <= ahead.interval()[:2]))
     return float(np.linalg.norm(off)), float(np.linalg.norm(plain)), inside
@@ -84,12 +84,12 @@ def compare(tips: Array, truth: Array) -> tuple[float, float, bool]:
 
 def _run(files: Sequence[str]) -> int:
     insertions = [tips_of(Path(file)) for file in files]
-    known = [(tips, place_at(tips, AHEAD)) for tips in insertions]
-    seen = [compare(tips, truth) for tips, truth in known if truth is not None]
-    if not seen:
+    known = [(tips, position_at(tips, AHEAD)) for tips in insertions]
+    compared = [compare(tips, truth) for tips, truth in known if truth is not None]
+    if not compared:
         raise UserError("no file has an insertion to 98 mm; give exp_*_00*.csv")
-    off, plain, inside = (np.array(column) for column in zip(*seen, strict=True))
-    print(f"{len(seen)} insertions of {len(files)} files, from {SEEN * 1e3:.0f} mm to 98 mm")
+    off, plain, inside = (np.array(column) for column in zip(*compared, strict=True))
+    print(f"{len(compared)} insertions of {len(files)} files, from {GIVEN * 1e3:.0f} mm to 98 mm")
     print(
         f"forecast off by {1e3 * np.median(off):.2f} mm, 90 %: {1e3 * np.percentile(off, 90):.2f}"
     )

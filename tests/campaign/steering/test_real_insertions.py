@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from campaign.steering.real_insertions import compare, place_at, tips_of
+from campaign.steering.real_insertions import compare, position_at, tips_of
 from needle_core.errors import UserError
 
 RADIUS = 2.0
@@ -27,7 +27,7 @@ def test_a_file_is_read_from_the_entry_on_and_forecast(tmp_path: Path) -> None:
     tips = tips_of(write(tmp_path / "exp.csv", 0.1))
     assert len(tips) == 101
     assert tips[-1, 2] == pytest.approx(0.1)
-    truth = place_at(tips, 0.098)
+    truth = position_at(tips, 0.098)
     assert truth is not None
     np.testing.assert_allclose(truth, [0.098**2 / (2.0 * RADIUS), 0.0], atol=1e-5)
     off, plain, inside = compare(tips, truth)
@@ -37,7 +37,7 @@ def test_a_file_is_read_from_the_entry_on_and_forecast(tmp_path: Path) -> None:
 
 
 def test_short_or_unsuitable_files_are_left_out(tmp_path: Path) -> None:
-    assert place_at(tips_of(write(tmp_path / "exp.csv", 0.09)), 0.098) is None
+    assert position_at(tips_of(write(tmp_path / "exp.csv", 0.09)), 0.098) is None
     (tmp_path / "other.csv").write_text("a,b\n1,2\n", encoding="utf-8")
-    with pytest.raises(UserError, match="wants columns"):
+    with pytest.raises(UserError, match="expected columns"):
         tips_of(tmp_path / "other.csv")

@@ -22,8 +22,8 @@ def recording(tmp_path: Path) -> Path:
     """Return a folder with images of an insertion with a needle, and of one without."""
     folder = tmp_path / "recording"
     insertion = ["--start-mm", "20", "--depth-mm", "60", "--step-mm", "2"]
-    for name, way in (("needle", insertion), ("empty", ["--depth-mm", "1", "--step-mm", "0.1"])):
-        words = ["--output", str(folder / name), "--scenario", "steel", "--seed", "3", *way]
+    for name, steps in (("needle", insertion), ("empty", ["--depth-mm", "1", "--step-mm", "0.1"])):
+        words = ["--output", str(folder / name), "--scenario", "steel", "--seed", "3", *steps]
         assert render_images(words) == 0
     shutil.copy(folder / "needle/calibration.yaml", folder)
     return folder

@@ -38,8 +38,8 @@ def test_the_stored_net_detects_unseen_needles(unseen: Batch) -> None:
     net = cv2.dnn.readNetFromONNX(str(WEIGHTS))
     rows, columns = np.indices((SIZE, SIZE))
     shown, excess, at_ends, without = [], [], [], []
-    for seen, share, end in zip(unseen.seen, unseen.shares, unseen.ends, strict=True):
-        net.setInput(seen[None])
+    for inputs, share, end in zip(unseen.inputs, unseen.shares, unseen.ends, strict=True):
+        net.setInput(inputs[None])
         shaft, log_intensity = (
             out[0, 0, CONTEXT:-CONTEXT, CONTEXT:-CONTEXT] for out in net.forward(["shaft", "end"])
         )

@@ -1,22 +1,17 @@
-"""`python -m campaign.tracking.traced_set`: renders the path-traced pairs of `scripts/verify C`.
+"""Path-traced pairs of `scripts/verify C`, which no development has used.
 
-One half of the set is for development; the other half is held back for `scripts/verify C`. Existing
-sequences are kept, so that an interrupted run can be continued.
+Existing sequences are kept, so that an interrupted run can be continued.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from needle_core.commands.cli import EXIT_DONE, run_command
-from needle_core.commands.options import CommandParser
 from needle_core.files.installed import find_shared_file
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.path_traced.appearance import Appearance, draw_appearance
@@ -27,9 +22,8 @@ from needle_sim.sequences.boxes import draw_box
 RIGS = ("bench", "top_and_side", "webcams")
 PAIRS = 6
 NEEDLES, ABSENT = 51, 21
-"""Number of sequences per half, with and without a needle; the rigs alternate."""
-LOOKED_AT, HELD_BACK = 30_000, 40_000
-"""First seed of each half."""
+"""Number of sequences, with and without a needle; the rigs alternate."""
+_FIRST_SEED = 40_000
 _STEP = 1e-3
 _BEGIN = (0.02, 0.085)  # insertion of the first pair; webcams see less of the path [m]
 _BEGIN_WEBCAMS = (0.015, 0.05)
@@ -94,26 +88,24 @@ class DrawnSequence:
     seen: NDArray[np.float64]
 
 
-def scenes(first_seed: int) -> list[TracedScene]:
-    """Return the sequences of a half, those without a needle among the others."""
+def _scenes() -> list[TracedScene]:
+    """Return the scenes of the set, those without a needle among the others."""
     found = []
     for number in range(NEEDLES):
-        found.append(TracedScene(RIGS[number % 3], "random", first_seed + number))
+        found.append(TracedScene(RIGS[number % 3], "random", _FIRST_SEED + number))
         if number % 5 in (1, 3) and number // 5 * 2 < ABSENT:
             at = len([scene for scene in found if scene.appearance == "absent"])
-            found.append(TracedScene(RIGS[at % 3], "absent", first_seed + 1000 + at))
+            found.append(TracedScene(RIGS[at % 3], "absent", _FIRST_SEED + 1000 + at))
     return found
 
 
-def drawn(folder: Path, wanted: Sequence[TracedScene]) -> Iterator[DrawnSequence]:
+def drawn(folder: Path) -> Iterator[DrawnSequence]:
     """Yield stored sequences, and trace missing ones.
 
     Parameters
     ----------
     folder : Path
         Folder of the sequences.
-    wanted : sequence of TracedScene
-        Requested sequences.
 
     Raises
     ------
@@ -121,7 +113,7 @@ def drawn(folder: Path, wanted: Sequence[TracedScene]) -> Iterator[DrawnSequence
         If one has to be traced and the path tracer is not installed.
     """
     folder.mkdir(exist_ok=True)
-    for scene in wanted:
+    for scene in _scenes():
         kept = folder / f"{scene.name}.npz"
         calibration = _calibration(folder, scene)
         if not kept.is_file():
@@ -157,24 +149,3 @@ def _traced(calibration: Path, scene: TracedScene) -> dict[str, NDArray[np.gener
         "tips": np.stack([nowhere if pair.truth is None else pair.truth.tip for pair in pairs]),
         "seen": np.array([pair.visible_share for pair in pairs]),
     }
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw the set, or one half of it; returns the exit code."""
-    parser = CommandParser("traced_set", str(__doc__), "")
-    parser.add_argument("folder", metavar="DIR", help="folder; existing sequences are kept")
-    parser.add_argument("--held-back", action="store_true", help="only the half that is held back")
-    given = parser.parse_args(arguments)
-    wanted = scenes(HELD_BACK) + ([] if given.held_back else scenes(LOOKED_AT))
-
-    def draw() -> int:
-        sequences = drawn(Path(given.folder).expanduser(), wanted)
-        for _ in tqdm(sequences, total=len(wanted), disable=not sys.stderr.isatty()):
-            pass
-        return EXIT_DONE
-
-    return run_command(draw)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

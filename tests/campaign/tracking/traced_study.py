@@ -36,14 +36,14 @@ class Variation:
         Given needle width relative to the true one.
     zero : float
         Error of the given insertion [m].
-    seen : callable
+    degrade : callable
         Function from image and random generator to image.
     """
 
     name: str
     width: float = 1.0
     zero: float = 0.0
-    seen: Callable[[Image, np.random.Generator], Image] = lambda image, _: image
+    degrade: Callable[[Image, np.random.Generator], Image] = lambda image, _: image
 
 
 def _blurred(sigma: float) -> Callable[[Image, np.random.Generator], Image]:
@@ -70,11 +70,11 @@ VARIATIONS = (
     Variation("width told 1.3 times", width=1.3),
     Variation("stage 1 mm too long", zero=1e-3),
     Variation("stage 1 mm too short", zero=-1e-3),
-    Variation("blur of 1 px", seen=_blurred(1.0)),
-    Variation("blur of 2 px", seen=_blurred(2.0)),
-    Variation("JPEG 20", seen=_coded),
-    Variation("noise 12", seen=_noisy),
-    Variation("gain 0.4", seen=_dim),
+    Variation("blur of 1 px", degrade=_blurred(1.0)),
+    Variation("blur of 2 px", degrade=_blurred(2.0)),
+    Variation("JPEG 20", degrade=_coded),
+    Variation("noise 12", degrade=_noisy),
+    Variation("gain 0.4", degrade=_dim),
 )
 
 
@@ -144,14 +144,14 @@ def tracked_pairs(
     """
     rng = np.random.default_rng(sequence.scene.seed)
     stereo = load_calibration(sequence.calibration)
-    left, right = (variation.seen(image, rng) for image in sequence.empty)
+    left, right = (variation.degrade(image, rng) for image in sequence.empty)
     tracker = NeedleTracker(
         stereo,
         StereoTrackerParameters(needle_width=variation.width * sequence.scene.look.diameter),
         (left, right) if known is KnownInput.EMPTY_PHANTOM else None,
     )
     for number, pair in enumerate(sequence.pairs):
-        left, right = (variation.seen(image, rng) for image in pair)
+        left, right = (variation.degrade(image, rng) for image in pair)
         insertion = float(sequence.insertions[number]) + variation.zero
         tip = tracker.process(left, right, None if known is KnownInput.NOTHING else insertion).tip
         if not sequence.scene.look.needle:

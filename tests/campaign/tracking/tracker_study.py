@@ -44,7 +44,7 @@ class Exposure:
         The tip's true pose.
     left, right : ndarray of uint8, shape (height, width)
         The images.
-    seen : pair of float
+    visible : pair of float
         Visible share of the last 10 mm in the left and the right image.
     """
 
@@ -52,7 +52,7 @@ class Exposure:
     T_rig_tip: NDArray[np.float64]
     left: NDArray[np.uint8]
     right: NDArray[np.uint8]
-    seen: tuple[float, float]
+    visible: tuple[float, float]
 
 
 def insertion_sequence(
@@ -93,8 +93,8 @@ def insertion_sequence(
         pose = np.asarray(plant.T_rig_tip)
         path = plant.centreline(SPACING)
         left, right = renderer.render(pose, path, number)
-        seen = renderer.visible_share(pose, path, number)
-        yield Exposure(STEP * (number + 1), pose, left, right, seen)
+        visible = renderer.visible_share(pose, path, number)
+        yield Exposure(STEP * (number + 1), pose, left, right, visible)
 
 
 def _turn_back(pose: NDArray[np.float64], steps: int) -> float:
@@ -103,8 +103,8 @@ def _turn_back(pose: NDArray[np.float64], steps: int) -> float:
     if float(np.hypot(*sideways)) < _STRAY:
         return 0.0
     # The needle bends towards -y of its own frame.
-    wanted = pose[:3, :3].T @ np.array([-sideways[0], -sideways[1], 0.0])
-    return math.remainder(math.atan2(wanted[0], -wanted[1]), 2.0 * math.pi) / steps
+    direction = pose[:3, :3].T @ np.array([-sideways[0], -sideways[1], 0.0])
+    return math.remainder(math.atan2(direction[0], -direction[1]), 2.0 * math.pi) / steps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ class TrackedRun:
         Squared error over its covariance; NaN where there is no tip.
     states : list of TrackState
         State after each pair.
-    seen : ndarray of bool, shape (n,)
+    visible : ndarray of bool, shape (n,)
         Whether both cameras see the needle's end.
     seconds : ndarray, shape (n,)
         CPU time of the thread for each pair [s].
@@ -128,7 +128,7 @@ class TrackedRun:
     errors: Array
     normalised: Array
     states: list[TrackState]
-    seen: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
     seconds: Array
 
     @property
@@ -149,8 +149,8 @@ class TrackedRun:
     def slowest_recovery(self) -> int:
         """Return the largest number of pairs until a visible needle was found again."""
         longest = waiting = 0
-        for seen, found in zip(self.seen, self.found, strict=True):
-            waiting = 0 if found or not seen else waiting + 1
+        for visible, found in zip(self.visible, self.found, strict=True):
+            waiting = 0 if found or not visible else waiting + 1
             longest = max(longest, waiting)
         return longest
 
@@ -178,7 +178,7 @@ def track_run(
         Whether the tracker is reset before every pair.
     """
     tracker.reset()
-    errors, normalised, states, seen, seconds = [], [], [], [], []
+    errors, normalised, states, visible, seconds = [], [], [], [], []
     for exposure in exposures:
         if searching:
             tracker.reset()
@@ -186,7 +186,7 @@ def track_run(
         measured = tracker.process(exposure.left, exposure.right, exposure.insertion)
         seconds.append(time.thread_time() - begin)
         states.append(measured.state)
-        seen.append(min(exposure.seen) >= _SEEN)
+        visible.append(min(exposure.visible) >= _SEEN)
         error, square = np.full(3, np.nan), np.nan
         # In the entry zone, a tip may come from the insertion alone: it does not count as found.
         if measured.tip is not None and measured.state is not TrackState.ENTRY:
@@ -195,7 +195,7 @@ def track_run(
         errors.append(error)
         normalised.append(square)
     return TrackedRun(
-        np.array(errors), np.array(normalised), states, np.array(seen), np.array(seconds)
+        np.array(errors), np.array(normalised), states, np.array(visible), np.array(seconds)
     )
 
 

@@ -65,14 +65,14 @@ class RosRigClient(WholeNode):
 
     Parameters
     ----------
-    places_from : str
+    position_topic : str
         Topic (sensor_msgs/JointState) of the position.
     holds : bool
         Whether it publishes device/hold.
 
     Attributes
     ----------
-    places : list of MotorPosition
+    positions : list of MotorPosition
         Received positions.
     status, controller : dict of str to str
         Last status of device and controller.
@@ -80,16 +80,16 @@ class RosRigClient(WholeNode):
         Whether the hold is pressed.
     """
 
-    def __init__(self, places_from: str = "joint_states", *, holds: bool = True) -> None:
+    def __init__(self, position_topic: str = "joint_states", *, holds: bool = True) -> None:
         super().__init__("hand")
-        self.places: list[MotorPosition] = []
+        self.positions: list[MotorPosition] = []
         self.status: dict[str, str] = {}
         self.controller: dict[str, str] = {}
         self.pressed = False
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         listen = self.create_subscription
-        listen(JointState, places_from, self._on_places, JOINT_STATES)
+        listen(JointState, position_topic, self._on_joints, JOINT_STATES)
         listen(DiagnosticStatus, "device/status", self._on_status, LATCHED)
         listen(
             DiagnosticStatus,
@@ -173,7 +173,7 @@ class RosRigClient(WholeNode):
     @property
     def insertion(self) -> float:
         """Present insertion [m]."""
-        return self.places[-1].insertion if self.places else 0.0
+        return self.positions[-1].insertion if self.positions else 0.0
 
     def last_motion(self, begin: float, end: float) -> float:
         """Return the time of the last motion in an interval [s]; its begin if there was none."""
@@ -181,19 +181,19 @@ class RosRigClient(WholeNode):
 
     def travelled_distance(self, begin: float, end: float = math.inf) -> float:
         """Return the distance travelled in an interval, in both directions [m]."""
-        return sum(way for _, way in self._motions(begin, end))
+        return sum(distance for _, distance in self._motions(begin, end))
 
     def _motions(self, begin: float, end: float) -> Iterator[tuple[MotorPosition, float]]:
         """Yield each changed position in an interval, and its distance from the one before."""
-        for before, after in itertools.pairwise(self.places):
-            way = abs(after.insertion - before.insertion)
-            if begin < after.time <= end and way > _STILL:
-                yield after, way
+        for before, after in itertools.pairwise(self.positions):
+            distance = abs(after.insertion - before.insertion)
+            if begin < after.time <= end and distance > _STILL:
+                yield after, distance
 
-    def _on_places(self, message: JointState, info: dict[str, int]) -> None:
+    def _on_joints(self, message: JointState, info: dict[str, int]) -> None:
         at = dict(zip(message.name, message.position, strict=True))
         sent = info["source_timestamp"] * 1e-9
-        self.places.append(MotorPosition(sent, at["insertion_joint"], at["rotation_joint"]))
+        self.positions.append(MotorPosition(sent, at["insertion_joint"], at["rotation_joint"]))
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self.status = values_of(message)

@@ -46,7 +46,7 @@ def steer(
     *,
     pushed: bool = False,
     latency: float = 0.033,
-    see: Callable[[SimulatedBench, SimRigParameters], Sensor] = TipSensor,
+    new_sensor: Callable[[SimulatedBench, SimRigParameters], Sensor] = TipSensor,
     **settings: float,
 ) -> tuple[str, np.ndarray]:
     """Steer a needle to the end; return the final state of the controller, and the path of the tip.
@@ -61,7 +61,7 @@ def steer(
         Whether a hand moves the insertion axis.
     latency : float
         Time from an exposure to the controller [s].
-    see : callable
+    new_sensor : callable
         Constructs the tip sensor.
     **settings : float
         Settings of the controller.
@@ -90,7 +90,7 @@ def steer(
         tip_noise=TIP_STD * math.sqrt(3.0),
         camera_rate=FRAME_RATE,
     )
-    sim = _SteeredRig(needle, new_sensor=see)
+    sim = _SteeredRig(needle, new_sensor=new_sensor)
     driver = {"max_depth": steering.depth + 0.01, "insertion_drive": "hand" if pushed else "motor"}
     late = (delay("needle/tip", latency),)
     rig = VirtualRig(seed, sim, PlaneController(steering), driver=driver, faults=late)
@@ -101,25 +101,25 @@ def steer(
     begun, before = rig.runner.now, rig.runner.now
     motor = rig.bus.drives["insertion"].motor
     counts = rig.drives.settings.insertion_counts_per_unit
-    way: list[tuple[float, float]] = []
+    path: list[tuple[float, float]] = []
 
     def tell(bench: SimulatedBench, now: float) -> None:
         nonlocal before
         rig.hand.held = held = hand(now - begun)
         motor.position += held.push * (now - before) * counts
         before = now
-        way.append((bench.insertion, float(bench.tip[0])))
+        path.append((bench.insertion, float(bench.tip[0])))
 
     sim.tell = tell
     while rig.hand.controller.state in _STEERING and rig.runner.now < begun + _LONGEST:
         rig.runner.run(0.1)
-    return rig.hand.controller.state, np.array(way)
+    return rig.hand.controller.state, np.array(path)
 
 
-def rms_at_end(way: np.ndarray, length: float = 0.02) -> float:
+def rms_at_end(path: np.ndarray, length: float = 0.02) -> float:
     """Return the RMS distance from the plane x = `OFFSET` over the last `length` of a path [m]."""
-    grid = np.linspace(way[-1, 0] - length, way[-1, 0], 201)
-    return math.sqrt(float(np.mean((np.interp(grid, *way.T) - OFFSET) ** 2)))
+    grid = np.linspace(path[-1, 0] - length, path[-1, 0], 201)
+    return math.sqrt(float(np.mean((np.interp(grid, *path.T) - OFFSET) ** 2)))
 
 
 # ---- hands --------------------------------------------------------------------------------------

@@ -57,13 +57,13 @@ class BagMonitor:
             kept = Counter[str]()
         else:
             kept = _counts(self._bag)
-        wanted = {
+        required = {
             topic: sum(at <= killed_at - _WRITTEN_OUT for at in taken)
             for topic, taken in self._taken.items()
         }
         return [
             f"{topic}: {count} came in time, {kept[topic]} are in the recovered bag"
-            for topic, count in sorted(wanted.items())
+            for topic, count in sorted(required.items())
             if kept[topic] < count
         ]
 

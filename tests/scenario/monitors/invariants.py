@@ -235,8 +235,8 @@ class InvariantMonitor:
             return
         off = self._before[1] - status.insertion_m
         if not -0.0005 <= off <= _BELIEF:
-            seen = f"the needle is {self._before[1] * 1e3:.2f} mm in"
-            said = f"the controller says {status.insertion_m * 1e3:.2f} mm, {seen}"
+            measured = f"the needle is {self._before[1] * 1e3:.2f} mm in"
+            said = f"the controller says {status.insertion_m * 1e3:.2f} mm, {measured}"
             self.violate("belief_equals_joints", at, said)
 
     # ---- checks ---------------------------------------------------------------------------------

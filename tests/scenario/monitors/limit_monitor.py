@@ -14,7 +14,7 @@ _SET_POINT_PERIOD = 0.02
 # of the previous cycle, one cycle later, and one more set-point may be in transit.
 _SET_POINTS_BEHIND = 3
 # Overshoot of the drives beyond the limits [m], [rad].
-_PLACE_ROOM, _TURN_ROOM = 0.0011, 0.3
+_DEPTH_MARGIN, _ROTATION_MARGIN = 0.0011, 0.3
 # Function codes of the process data that carry controlword and mode, and the target (CiA 402).
 _CONTROL, _TARGET = 0x200, 0x300
 # Bits of the controlword that let a drive operate, and cyclic synchronous position mode.
@@ -79,7 +79,7 @@ class SpeedBudget:
         """Reset; the next position is the first one."""
         self._least = {1.0: math.inf, -1.0: math.inf}
 
-    def ahead(self, at: float, place: float) -> float:
+    def ahead(self, at: float, position: float) -> float:
         """Return by how much the motion to a position exceeds what `speed` allows.
 
         This is the maximum over all spans that end now of the distance less speed x duration.
@@ -88,12 +88,12 @@ class SpeedBudget:
         ----------
         at : float
             Time [s].
-        place : float
+        position : float
             Position in any unit.
         """
         most = 0.0
         for sign, least in self._least.items():
-            beyond = sign * place - self._speed * at
+            beyond = sign * position - self._speed * at
             self._least[sign] = min(least, beyond)
             most = max(most, beyond - self._least[sign])
         return most
@@ -101,19 +101,19 @@ class SpeedBudget:
 
 @dataclasses.dataclass(frozen=True)
 class _Axis:
-    """One axis; `scale` converts from SI to `unit`, `behind` is its largest lag [SI]."""
+    """One axis; `scale` converts from SI to `unit`, `lag` is its largest lag [SI]."""
 
     name: str
     unit: str
     scale: float
     speed: float
-    behind: float
+    lag: float
     set_points: SpeedBudget
     motor: SpeedBudget
 
-    def said(self, way: float, most: float) -> str:
+    def said(self, distance: float, most: float) -> str:
         """Return a distance and its bound as text."""
-        return f"{way * self.scale:.4g} {self.unit} (at most {most * self.scale:.4g})"
+        return f"{distance * self.scale:.4g} {self.unit} (at most {most * self.scale:.4g})"
 
 
 class LimitMonitor:
@@ -132,16 +132,16 @@ class LimitMonitor:
         # A set-point may be early by its whole period.
         self._early = _SET_POINT_PERIOD + late
 
-        def axis(name: str, unit: str, scale: float, speed: float, behind: float) -> _Axis:
-            behind += _SET_POINTS_BEHIND * _SET_POINT_PERIOD * speed
-            return _Axis(name, unit, scale, speed, behind, SpeedBudget(speed), SpeedBudget(speed))
+        def axis(name: str, unit: str, scale: float, speed: float, lag: float) -> _Axis:
+            lag += _SET_POINTS_BEHIND * _SET_POINT_PERIOD * speed
+            return _Axis(name, unit, scale, speed, lag, SpeedBudget(speed), SpeedBudget(speed))
 
         self._axes = (
             axis("insertion", "mm", 1e3, bounds.max_speed, bounds.insertion_following_error),
             axis("rotation", "rad", 1.0, bounds.max_rotation_rate, bounds.rotation_following_error),
         )
 
-    def observe_set_point(self, at: float, axis: int, place: float | None) -> Iterator[str]:
+    def observe_set_point(self, at: float, axis: int, position: float | None) -> Iterator[str]:
         """Observe a set-point that is sent to a drive.
 
         Parameters
@@ -150,7 +150,7 @@ class LimitMonitor:
             Time [s].
         axis : int
             0 is insertion, 1 rotation.
-        place : float or None
+        position : float or None
             Set-point [m], [rad]; None if the drive is not enabled.
 
         Yields
@@ -159,10 +159,10 @@ class LimitMonitor:
             Violation of a limit.
         """
         its = self._axes[axis]
-        if place is None:
+        if position is None:
             its.set_points.forget()
             return
-        ahead, bound = its.set_points.ahead(at, place), its.speed * self._early
+        ahead, bound = its.set_points.ahead(at, position), its.speed * self._early
         if ahead > bound:
             yield f"set-points of {its.name} {its.said(ahead, bound)} ahead of its speed limit"
 
@@ -176,14 +176,14 @@ class LimitMonitor:
         insertion, rotation : float
             [m], [rad].
         """
-        deepest = self._bounds.max_depth + _PLACE_ROOM
+        deepest = self._bounds.max_depth + _DEPTH_MARGIN
         if insertion > deepest:
             yield f"insertion is {insertion * 1e3:.4g} mm, at most {deepest * 1e3:.4g}"
-        farthest = self._bounds.max_rotation + _TURN_ROOM
+        farthest = self._bounds.max_rotation + _ROTATION_MARGIN
         if abs(rotation) > farthest:
             yield f"rotation is {rotation:.4g} rad, at most {farthest:.4g} either way"
-        for its, place in zip(self._axes, (insertion, rotation), strict=True):
+        for its, position in zip(self._axes, (insertion, rotation), strict=True):
             # A lagging drive catches up at its full speed (docs/safety.md, following_error).
-            ahead = its.motor.ahead(at, place)
-            if ahead > its.behind:
-                yield f"{its.name} went {its.said(ahead, its.behind)} farther than its speed allows"
+            ahead = its.motor.ahead(at, position)
+            if ahead > its.lag:
+                yield f"{its.name} went {its.said(ahead, its.lag)} farther than its speed allows"

@@ -85,21 +85,21 @@ class Bench(Component):
     def _tick(self, at: Moment) -> Actions:
         axes = self._bus.axes(at.steady)
         self.motors = Motors(axes["insertion"].position, axes["rotation"].position)
-        if any(abs(way) > piece for way, piece in zip(self._way, _PIECE, strict=True)):
+        if any(abs(step) > piece for step, piece in zip(self._travel, _PIECE, strict=True)):
             self._follow_motors()
         for watch in self.watchers:
             watch(at.steady, self.motors)
         return ()
 
     @property
-    def _way(self) -> tuple[float, float]:
+    def _travel(self) -> tuple[float, float]:
         """Motion of the motors since the needle followed them [m], [rad]."""
         at, taken = self.motors, self._taken
         return at.insertion - taken.insertion, at.rotation - taken.rotation
 
     def _follow_motors(self) -> None:
-        if any(self._way):
-            self._plant.advance(*self._way)
+        if any(self._travel):
+            self._plant.advance(*self._travel)
         self._taken = self.motors
         if self.motors.insertion > self._deepest:
             self._deepest = self.motors.insertion
@@ -153,15 +153,15 @@ class TrackerStandIn(Component):
         late = draw(0.0, _LATEST_ANSWER)
         if self.camera_state is not CameraState.FROZEN:
             self._last = self._bench.tip + noise
-        seen = self._last + wrong if self.camera_state is CameraState.WRONG else self._last
+        measured = self._last + wrong if self.camera_state is CameraState.WRONG else self._last
         due = at.steady + (late if self.camera_state is CameraState.LATE else 0.0)
-        self._answers.append((due, list(self._answer(seen, at.stamp_ns))))
+        self._answers.append((due, list(self._answer(measured, at.stamp_ns))))
         for answer in [one for one in self._answers if one[0] <= at.steady]:
             self._answers.remove(answer)
             yield from answer[1]
 
-    def _answer(self, seen: np.ndarray, stamp_ns: int) -> Actions:
-        x, y, z = seen.tolist()
+    def _answer(self, measured: np.ndarray, stamp_ns: int) -> Actions:
+        x, y, z = measured.tolist()
         found = self.camera_state is not CameraState.BLACK
         covariance = [0.0] * 36
         variance = TIP_NOISE**2 / 3.0 if found else math.inf

@@ -27,7 +27,7 @@ _WORK, _JOB = 0.005, (2e-6, 40e-6)
 _SLOWEST_JOB = 0.005
 # Free space at which a recording ends [B].
 _RESERVE = 1_000_000
-_ROOM = 10**9
+_FREE = 10**9
 
 
 class Disk:
@@ -35,7 +35,7 @@ class Disk:
 
     Attributes
     ----------
-    room : int
+    free : int
         Reported free space [B].
     error : int
         `errno` of every write; 0: no error.
@@ -47,7 +47,7 @@ class Disk:
 
     def __init__(self) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="needle_soak_"))
-        self.room, self.error = _ROOM, 0
+        self.free, self.error = _FREE, 0
         self.is_frozen = False
         self.slowness = 0.0
         self._count = 0
@@ -65,13 +65,13 @@ class Disk:
             self.slowness = fault.size * _SLOWEST_JOB
         elif fault.kind is Kind.OFF and fault.size < 0.5:
             # Others fill the disk: the reported free space shows it.
-            self.room = 0
+            self.free = 0
         else:
             self.error = errno.EIO if fault.kind is Kind.GARBAGE else errno.ENOSPC
         return self._mend
 
     def _mend(self) -> None:
-        self.room, self.error, self.is_frozen, self.slowness = _ROOM, 0, False, 0.0
+        self.free, self.error, self.is_frozen, self.slowness = _FREE, 0, False, 0.0
 
     def close(self) -> None:
         """Remove all files of the disk."""
@@ -106,7 +106,7 @@ class _Space(FreeSpace):
         self.reserve = _RESERVE
 
     def usable(self) -> int:
-        return self._disk.room - self.reserve
+        return self._disk.free - self.reserve
 
 
 class _Jobs:

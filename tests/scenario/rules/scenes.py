@@ -138,14 +138,14 @@ def coordinated() -> None:
     """Rotation follows insertion in proportion, also while the speed scale changes."""
     scene = VirtualRig(1)
     scene.ready()
-    places = [scene.place]
+    positions = [scene.place]
     stamp = scene.step()
     while stamp not in scene.hand.results:
-        scene.hand.held = Held(True, 1.0 if len(places) < 10 else 0.3)
+        scene.hand.held = Held(True, 1.0 if len(positions) < 10 else 0.3)
         scene.runner.run(PERIOD)
-        places.append(scene.place)
-    begin, end = places[0], places[-1]
-    for at in places:
+        positions.append(scene.place)
+    begin, end = positions[0], positions[-1]
+    for at in positions:
         insertion, rotation = (
             (now - first) / (last - first) for now, first, last in zip(at, begin, end, strict=True)
         )

@@ -25,7 +25,7 @@ class EmulatedPort:
     def __init__(self, **settings: Any) -> None:
         self.bus = DriveEmulator(DriveEmulatorParameters(**settings)).bus
         self.now = 0.0
-        self.places: set[float] = set()
+        self.positions: set[float] = set()
 
     def open(self, arrive: Callable[[Any], None]) -> None:
         self.arrive = arrive
@@ -33,7 +33,7 @@ class EmulatedPort:
 
     def send(self, batch: tuple[CanFrame, ...]) -> None:
         self.now += 0.01
-        self.places |= {axis.position for axis in self.bus.axes(self.now).values()}
+        self.positions |= {axis.position for axis in self.bus.axes(self.now).values()}
         if replies := self.bus.receive(batch, self.now) + self.bus.poll(self.now):
             self.arrive(tuple(replies))
 
@@ -69,7 +69,7 @@ def test_connected_drives_are_described_and_do_not_move(
     assert code == 0
     assert "look_ahead            within 0.33 mm\n" in output
     assert "drive_watchdog        within 0.33 mm\n" in output
-    assert port.places == {0.01, 0.0}
+    assert port.positions == {0.01, 0.0}
     assert {drive.state.name for drive in port.bus.drives.values()} == {"SWITCH_ON_DISABLED"}
 
 

@@ -129,8 +129,8 @@ def test_drives_are_set_up_in_parallel_and_homing_starts_when_both_have_limits()
         for time, _, frame in bus.frames
         if time >= begin and frame.identifier in (0x581, 0x582) and frame.data[0] == 0x60
     }
-    wanted = itertools.product((0x581, 0x582), (LIMITS, HOMING_SPEEDS), (1, 2))
-    assert max(taken[key] for key in wanted) < min(first, replied)
+    required = itertools.product((0x581, 0x582), (LIMITS, HOMING_SPEEDS), (1, 2))
+    assert max(taken[key] for key in required) < min(first, replied)
     assert replied > bus.until
 
 

@@ -76,13 +76,13 @@ def test_random_messages_neither_fail_nor_move_a_rig(level: str) -> None:
     failures: list[str] = []
     depths: set[float] = set()
 
-    def see(_: int, sender: str, message: Any, output: Output) -> None:
+    def watch(_: int, sender: str, message: Any, output: Output) -> None:
         if output is LOG and "internal error" in message.text:
             failures.append(f"{sender}: {message.text}")
         if output.topic == "sim/tip_pose":
             depths.add(message.position[2])
 
-    runner = VirtualRunner([*parts, careless], seed=1, taps=(see,))
+    runner = VirtualRunner([*parts, careless], seed=1, taps=(watch,))
     assert not runner.run(SECONDS), runner.exits
     assert set(failures) == set()
     assert len(depths) == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -11,9 +12,9 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from made_up_run import make_run, write_run
+from made_up_run import copy_messages, make_run, serialized, write_run
 from needle_bags.format.bag_writer import BagCopy
-from needle_bags.reading.bag_messages import raw_as_sent, read_contents
+from needle_bags.reading.bag_messages import SentMessage, read_contents
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_bags.report import report
 
@@ -47,13 +48,9 @@ def cut_bag(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], Path]
 
     def cut(insertion: float) -> Path:
         row = int(np.searchsorted(run.joints.values[:, 0], insertion))
-        bag = tmp_path_factory.mktemp("cut") / "bag"
+        bag, end = tmp_path_factory.mktemp("cut") / "bag", run.joints.received[row]
         copy = BagCopy(bag, contents.distribution, contents.custom_data)
-        for message in raw_as_sent(BAG, lambda _: True):
-            if message.log_time < run.joints.received[row]:
-                copy.put(
-                    contents.topics[message.topic], message.data, message.log_time, message.time
-                )
+        copy_messages(BAG, copy, lambda message: message.data if message.log_time < end else None)
         copy.close()
         return bag
 
@@ -80,16 +77,16 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, str]:
         "versions": '{"system": "<script>alert(1)</script>"}',
     }
     copy = BagCopy(bag, contents.distribution, custom)
-    tips = 0
-    for message in raw_as_sent(BAG, lambda _: True):
-        topic, data = contents.topics[message.topic], message.data
-        if topic.name == "/needle/tip":
-            tips += 1
-            if tips == 60:
-                tip: Any = STORE.deserialize_cdr(data, topic.type_name)
-                tip.point.x = math.nan
-                data = bytes(STORE.serialize_cdr(tip, topic.type_name))
-        copy.put(topic, data, message.log_time, message.time)
+    tips = itertools.count(1)
+
+    def spoil(message: SentMessage) -> bytes:
+        if message.topic == "/needle/tip" and next(tips) == 60:
+            tip: Any = STORE.deserialize_cdr(message.data, message.type_name)
+            tip.point.x = math.nan
+            return serialized(tip)
+        return message.data
+
+    copy_messages(BAG, copy, spoil)
     copy.close()
     assert report.main([str(bag)]) == 0
     return read_run(bag), (bag / "report.html").read_text()

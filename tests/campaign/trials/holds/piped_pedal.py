@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
 import struct
@@ -20,7 +19,7 @@ _LONGEST_READ = 65536
 
 
 class PipedPedal:
-    """The pedal, initially plugged in.
+    """The pedal, initially released.
 
     Parameters
     ----------
@@ -29,31 +28,18 @@ class PipedPedal:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._down = False
-        self._pipe: int | None = None
-        self.plug()
-
-    def plug(self) -> None:
-        """Plug it in; a pressed key is pressed from the first read on."""
-        os.mkfifo(self._path)
+        os.mkfifo(path)
         # Opened for reading too: a write-only open fails without a reader.
-        self._pipe = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)
-        self.press(self._down)
-
-    def unplug(self) -> None:
-        """Unplug it."""
-        if self._pipe is not None:
-            os.close(self._pipe)
-            self._path.unlink()
-        self._pipe = None
+        self._pipe = os.open(path, os.O_RDWR | os.O_NONBLOCK)
 
     def press(self, down: bool) -> None:
-        """Press or release it, also while it is unplugged."""
-        self._down = down
-        if self._pipe is not None:
-            events = _EVENT.pack(0, 0, _KEY, KEY, down) + _EVENT.pack(0, 0, _SYN, 0, 0)
-            os.write(self._pipe, events)
+        """Press or release it."""
+        events = _EVENT.pack(0, 0, _KEY, KEY, down) + _EVENT.pack(0, 0, _SYN, 0, 0)
+        os.write(self._pipe, events)
+
+    def close(self) -> None:
+        """Close the pipe."""
+        os.close(self._pipe)
 
 
 class PipeDevice:
@@ -72,17 +58,14 @@ class PipeDevice:
     def __init__(self, path: str) -> None:
         self._is_down = False
         self._pipe = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        with contextlib.suppress(OSError):
-            self.read()
+        self.read()
 
     def read(self) -> bytes:
-        """Return pending events; raises OSError if the pedal was unplugged."""
+        """Return pending events."""
         try:
             data = os.read(self._pipe, _LONGEST_READ)
         except BlockingIOError:
             return b""
-        if not data:
-            raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
         for _, _, kind, _, value in _EVENT.iter_unpack(data):
             self._is_down = bool(value) if kind == _KEY else self._is_down
         return data

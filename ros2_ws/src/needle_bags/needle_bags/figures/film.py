@@ -105,14 +105,14 @@ def _spread(insertion: Floats) -> npt.NDArray[np.int64]:
     travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(insertion)))])
     if not travel[-1] > 0.0:
         travel = np.arange(len(insertion), dtype=np.float64)
-    wanted = np.linspace(0.0, travel[-1], MAX_FRAMES)
-    return np.unique(np.searchsorted(travel, wanted - 1e-9 * travel[-1]).clip(max=len(travel) - 1))
+    spaced = np.linspace(0.0, travel[-1], MAX_FRAMES)
+    return np.unique(np.searchsorted(travel, spaced - 1e-9 * travel[-1]).clip(max=len(travel) - 1))
 
 
 def _trails(run: Run, series: Series, stamps: Stamps) -> list[Floats]:
     """Return the needle at each stamp, from the entry to the tip; (0, 3) without a tip."""
     insertions = run.insertion_at(series.stamps).tolist()
-    wanted = frozenset(stamps.tolist())
+    requested = frozenset(stamps.tolist())
     trail = ShaftTrail()
     found: dict[int, Floats] = {}
     for stamp, insertion, row in zip(
@@ -122,7 +122,7 @@ def _trails(run: Run, series: Series, stamps: Stamps) -> list[Floats]:
         if not np.isfinite(position).all():
             continue
         trail.add(insertion, position)
-        if stamp in wanted:
+        if stamp in requested:
             found[stamp] = trail.shaft(insertion, position)
     return [found.get(stamp, np.empty((0, 3))) for stamp in stamps.tolist()]
 
@@ -214,13 +214,13 @@ def camera_views(run: Run, frames: Sequence[Frame]) -> list[View]:
     for index, side, image in images_at(run, stamps):
         pictures[index, side] = _small_jpeg(image)
         sizes.setdefault(side, (image.shape[1], image.shape[0]))
-    seen_by = projections(run) if sizes else {}
+    projection_of = projections(run) if sizes else {}
     return [
         View(
             f"{side} camera",
             sizes[side],
             [pictures.get((index, side), b"") for index in range(len(frames))],
-            [_pixels(seen_by.get(side), frame.shaft) for frame in frames],
+            [_pixels(projection_of.get(side), frame.shaft) for frame in frames],
         )
         for side in SIDES
         if side in sizes
@@ -240,12 +240,12 @@ def _plan_view(run: Run, frames: Sequence[Frame], axis: int, name: str) -> View:
         known.append(point[None])
     elif axis == 0:
         known.append(np.array([[plane - GOAL, 0.0, 0.0], [plane + GOAL, 0.0, 0.0]]))
-    places = np.concatenate(known) * MM
+    points = np.concatenate(known) * MM
     with stacked(1, 2.5, top=0.12) as (figure, (axes,)):
-        low, high = places.min(axis=0), places.max(axis=0)
-        room = 0.06 * (high - low) + 0.2
-        axes.set_xlim(low[2] - room[2], high[2] + room[2])
-        axes.set_ylim(low[axis] - room[axis], high[axis] + room[axis])
+        low, high = points.min(axis=0), points.max(axis=0)
+        margin = 0.06 * (high - low) + 0.2
+        axes.set_xlim(low[2] - margin[2], high[2] + margin[2])
+        axes.set_ylim(low[axis] - margin[axis], high[axis] + margin[axis])
         if point is not None:
             axes.plot(point[2] * MM, point[axis] * MM, "*", ms=13, color=GOAL_BAND)
         elif axis == 0:

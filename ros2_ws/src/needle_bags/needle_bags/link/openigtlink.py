@@ -117,17 +117,17 @@ class OpenIGTLink(Component):
             roles = [_role(name) or common for name, _ in points]
             if common and len(points) == 2 and not any(_role(name) for name, _ in points):
                 roles = ["entry", "target"]
-            places: dict[str, m.Vector3] = {}
+            positions_of: dict[str, m.Vector3] = {}
             for role, (_, position) in zip(roles, points, strict=True):
-                if role in places:
+                if role in positions_of:
                     raise UserError(f"several points named {role}")
                 if role:
-                    places[role] = position
-            distance = math.hypot(*places.get("entry", (0.0,)))
+                    positions_of[role] = position
+            distance = math.hypot(*positions_of.get("entry", (0.0,)))
             if not distance <= _ENTRY_TOLERANCE:
                 raise UserError(f"the entry is {1e3 * distance:.1f} mm from that of the rig")
-            if "target" in places:
-                yield proposed_target(places["target"], at.stamp_ns)
+            if "target" in positions_of:
+                yield proposed_target(positions_of["target"], at.stamp_ns)
         except UserError as error:
             level, line = Level.WARN, f"{message.name}: {error}"
             yield Log("warning", line, "plan")

@@ -185,10 +185,10 @@ class PeerTopics(Component):
             case "tip" if tip is not None and needle.tip_found:
                 return tip.stamp_ns, tip.pose[None]
             case "base" if joints.names:
-                places = dict(zip(joints.names, joints.positions, strict=False))
-                turn = Rotation.from_euler("z", places.get(m.ROTATION_JOINT, 0.0)).as_matrix()
-                place = (0.0, 0.0, places[m.INSERTION_JOINT])
-                return joints.stamp_ns, pose_matrix(turn, place)[None]
+                positions = dict(zip(joints.names, joints.positions, strict=False))
+                turn = Rotation.from_euler("z", positions.get(m.ROTATION_JOINT, 0.0)).as_matrix()
+                position = (0.0, 0.0, positions[m.INSERTION_JOINT])
+                return joints.stamp_ns, pose_matrix(turn, position)[None]
             case "entry":
                 return now, np.eye(4)[None]
             case "target" if target is not None:

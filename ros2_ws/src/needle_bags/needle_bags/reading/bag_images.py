@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,10 @@ import numpy.typing as npt
 from needle_bags.format.bag_writer import stamp_of
 from needle_bags.reading.bag_messages import raw_as_sent, read_messages
 from needle_bags.reading.bag_reader import Run
+from needle_core.convert import from_ros
 from needle_core.errors import UserError
 from needle_core.message_types import to_nanoseconds
+from needle_core.messages import Image
 
 SIDES = ("left", "right")
 TOPICS = {
@@ -26,37 +27,27 @@ TOPICS = {
 Stamps = npt.NDArray[np.int64]
 
 
-@dataclasses.dataclass(frozen=True)
-class PlainImage:
-    """Fields of a sensor_msgs/Image, for a decompressed image."""
-
-    header: Any
-    height: int
-    width: int
-    encoding: str
-    step: int
-    data: npt.NDArray[np.uint8]
-
-
-def plain_image(message: Any) -> Any:
+def plain_image(message: Any) -> Image:
     """Return an image message, decompressed if necessary.
 
     An image that cannot be decompressed has no pixels; its `encoding` is the compressed format.
     """
     if not hasattr(message, "format"):
-        return message
+        raw: Image = from_ros(Image, message)
+        return raw
+    stamp_ns, frame = to_nanoseconds(message.header.stamp), message.header.frame_id
     encoded = np.frombuffer(message.data, np.uint8)
     try:
         pixels = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if len(encoded) else None
     except cv2.error:  # larger than OpenCV supports
         pixels = None
     if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint8:
-        return PlainImage(message.header, 0, 0, str(message.format), 0, np.empty(0, np.uint8))
+        return Image(stamp_ns, frame, 0, 0, str(message.format), 0, b"")
     height, width = pixels.shape
-    return PlainImage(message.header, height, width, "mono8", width, pixels.ravel())
+    return Image(stamp_ns, frame, height, width, "mono8", width, pixels.tobytes())
 
 
-def pixels_of(image: Any, path: Path) -> npt.NDArray[np.uint8]:
+def pixels_of(image: Image, path: Path) -> npt.NDArray[np.uint8]:
     """Return a mono image's pixels (H, W).
 
     Raises
@@ -102,10 +93,10 @@ def images_at(run: Run, stamps: Stamps) -> Iterator[tuple[int, str, npt.NDArray[
     UserError
         If the bag cannot be read.
     """
-    wanted = {int(stamp): index for index, stamp in enumerate(stamps)}
+    index_of = {int(stamp): index for index, stamp in enumerate(stamps)}
     names = {run.namespace + topic: side for topic, side in TOPICS.items()}
     for topic, _, message in read_messages(run.path, lambda name: name in names):
-        index = wanted.get(to_nanoseconds(message.header.stamp))
+        index = index_of.get(to_nanoseconds(message.header.stamp))
         if index is None:
             continue
         image = plain_image(message)

@@ -55,7 +55,7 @@ def read_contents(path: Path) -> BagDirectory:
         return bag
 
 
-def read_messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:
+def read_messages(path: Path, select: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:
     """Yield (topic, log time [ns], message) of the selected topics, in order of log time.
 
     Messages are decoded with the definitions in the bag.
@@ -67,12 +67,12 @@ def read_messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[s
     """
     with BagDirectory(path) as bag:
         store = bag.typestore()
-        for message in bag.messages(wanted):
+        for message in bag.messages(select):
             yield message.topic, message.log_time, bag.deserialize(store, message)
 
 
 def messages_as_sent(
-    path: Path, wanted: Callable[[str], bool], reorder: Reorder | None = None
+    path: Path, select: Callable[[str], bool], reorder: Reorder | None = None
 ) -> Iterator[tuple[SentMessage, Any]]:
     """Yield raw and decoded messages in the order of `raw_as_sent`.
 
@@ -80,11 +80,11 @@ def messages_as_sent(
     """
     with BagDirectory(path) as bag:
         store = bag.typestore()
-        for sent in _as_sent(bag, wanted, reorder):
+        for sent in _as_sent(bag, select, reorder):
             yield sent, bag.deserialize(store, sent)
 
 
-def raw_as_sent(path: Path, wanted: Callable[[str], bool]) -> Iterator[SentMessage]:
+def raw_as_sent(path: Path, select: Callable[[str], bool]) -> Iterator[SentMessage]:
     """Yield the messages of the selected topics in the order of sending.
 
     Images do not fit into memory, so each image topic is assumed to be in that order already.
@@ -93,7 +93,7 @@ def raw_as_sent(path: Path, wanted: Callable[[str], bool]) -> Iterator[SentMessa
     ----------
     path : Path
         The bag.
-    wanted : callable
+    select : callable
         Returns whether a topic is selected.
 
     Raises
@@ -102,15 +102,15 @@ def raw_as_sent(path: Path, wanted: Callable[[str], bool]) -> Iterator[SentMessa
         If the bag cannot be read.
     """
     with BagDirectory(path) as bag:
-        yield from _as_sent(bag, wanted, None)
+        yield from _as_sent(bag, select, None)
 
 
 def _as_sent(
-    bag: BagDirectory, wanted: Callable[[str], bool], reorder: Reorder | None
+    bag: BagDirectory, select: Callable[[str], bool], reorder: Reorder | None
 ) -> Iterator[SentMessage]:
     images = {name for name, topic in bag.topics.items() if topic.type_name in IMAGE_TYPES}
-    small = list(bag.messages(lambda name: wanted(name) and name not in images))
-    streamed = bag.messages(lambda name: wanted(name) and name in images)
+    small = list(bag.messages(lambda name: select(name) and name not in images))
+    streamed = bag.messages(lambda name: select(name) and name in images)
     if not _clocks_agree(small):
         small, streamed = list(map(_as_received, small)), map(_as_received, streamed)
         reorder = None

@@ -255,14 +255,14 @@ def namespaces(contents: BagDirectory) -> list[str]:
     )
 
 
-def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
+def namespace_of(contents: BagDirectory, requested: str | None = None) -> str:
     """Return the namespace of the rig to read; it ends with `/`.
 
     Parameters
     ----------
     contents : BagDirectory
         The bag.
-    wanted : str, optional
+    requested : str, optional
         Namespace given by the user; required if the bag contains several rigs.
 
     Raises
@@ -277,10 +277,10 @@ def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
             f"{len(contents.topics)}; give a bag that the rig's recorder made"
         )
     listed = ", ".join(name.rstrip("/") or "/" for name in found)
-    if wanted is not None:
-        namespace = f"/{wanted.strip('/')}/".replace("//", "/")
+    if requested is not None:
+        namespace = f"/{requested.strip('/')}/".replace("//", "/")
         if namespace not in found:
-            raise UserError(f"{contents.path} has no rig in {wanted}; it has rigs in {listed}")
+            raise UserError(f"{contents.path} has no rig in {requested}; it has rigs in {listed}")
         return namespace
     if len(found) > 1:
         raise UserError(

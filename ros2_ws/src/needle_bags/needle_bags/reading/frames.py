@@ -58,8 +58,8 @@ def read_frames(path: str | Path, topics: Collection[str] = ()) -> dict[str, pd.
     for name in topics:
         if name not in types:
             raise UserError(f"{path}: no topic {name} (it has {', '.join(sorted(types))})")
-    wanted = topics or {name for name, kind in types.items() if kind not in IMAGE_TYPES}
-    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in sorted(wanted)}
+    selected = topics or {name for name, kind in types.items() if kind not in IMAGE_TYPES}
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in sorted(selected)}
     for topic, log_time, message in read_messages(path, rows.__contains__):
         for row in _rows(message):
             rows[topic].append({INDEX: log_time * 1e-9, RECEIVED: log_time * 1e-9, **row})

@@ -72,12 +72,12 @@ def _exposures(run: Run) -> set[int]:
     depth = run.insertion_at(stamps)
     if not np.isfinite(depth).any():
         raise UserError(f"{run.path} has no exposures with a known insertion")
-    return {int(stamps[np.nanargmin(np.abs(depth - wanted))]) for wanted in DEPTHS}
+    return {int(stamps[np.nanargmin(np.abs(depth - insertion))]) for insertion in DEPTHS}
 
 
 def _put_image(copy: BagCopy, message: SentMessage, source: Path) -> None:
-    image = plain_image(_STORE.deserialize_cdr(message.data, message.type_name))
-    pixels = pixels_of(image, source)
+    image: Any = _STORE.deserialize_cdr(message.data, message.type_name)
+    pixels = pixels_of(plain_image(image), source)
     if not pixels.size:
         return
     _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])

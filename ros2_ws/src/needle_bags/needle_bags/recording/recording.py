@@ -167,8 +167,8 @@ class Recording:
     def append(self, message: Received) -> None:
         """Queue a message; drop and count it if the backlog limit is reached."""
         is_small = len(message.data) <= SMALL
-        room = self._waiting_limit // _SHARE_FOR_SMALL if is_small else 0
-        if self.bytes_waiting > self._waiting_limit + room:
+        extra = self._waiting_limit // _SHARE_FOR_SMALL if is_small else 0
+        if self.bytes_waiting > self._waiting_limit + extra:
             self._drop(message.topic)
         else:
             self.append_all((message,))

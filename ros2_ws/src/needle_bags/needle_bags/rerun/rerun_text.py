@@ -153,9 +153,9 @@ def _missing(run: Run, topic: TopicResult) -> str:
     parts = []
     for stamps, words in ((topic.missing, "recorded only"), (topic.extra, "only today")):
         if stamps:
-            places = ", ".join(_where(run, stamp) for stamp in stamps[:_SHOWN])
+            depths = ", ".join(_where(run, stamp) for stamp in stamps[:_SHOWN])
             more = ", ..." if len(stamps) > _SHOWN else ""
-            parts.append(f"  {topic.topic}: {len(stamps)} {words} (at {places}{more})")
+            parts.append(f"  {topic.topic}: {len(stamps)} {words} (at {depths}{more})")
     return "\n".join(parts)
 
 

@@ -101,8 +101,9 @@ class BagStage:
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
         """Process a message of a topic, given by relative name; return the outputs."""
         row, at = self._rows[topic], Moment(sent.time * 1e-9, sent.time, sent.time)
-        plain = plain_image(message) if row.message is Image else message
-        published = self.runner.deliver(row.topic, from_ros(row.message, plain), at)
+        is_image = row.message is Image
+        content = plain_image(message) if is_image else from_ros(row.message, message)
+        published = self.runner.deliver(row.topic, content, at)
         return [_output(action, sent.log_time) for action in published]
 
     def finish(self, log_time: int) -> list[Output]:

@@ -185,11 +185,11 @@ def reached_depth(run: Run) -> bool:
     if any(status.values.get("state") == "DONE" for status in run.controller_status):
         return True
     try:
-        wanted = float(run.last_status("depth_m"))
+        commanded = float(run.last_status("depth_m"))
     except ValueError:
         return False
     deepest = float(run.joints.values[:, 0].max(initial=0.0))
-    return deepest >= wanted - DEPTH_TOLERANCE
+    return deepest >= commanded - DEPTH_TOLERANCE
 
 
 def stop_cause(run: Run) -> str:

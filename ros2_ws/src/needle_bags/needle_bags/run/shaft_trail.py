@@ -69,9 +69,9 @@ class ShaftTrail:
         ndarray, shape (n, 3)
             Points in `rig` from the entry to the tip [m].
         """
-        behind = [
+        passed = [
             position
             for at, position in zip(self._insertions, self._positions, strict=True)
             if at < max(insertion - 0.5 * _SPACING, _OUT)
         ]
-        return np.array([*behind, tip])
+        return np.array([*passed, tip])

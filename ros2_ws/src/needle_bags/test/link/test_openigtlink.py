@@ -26,6 +26,7 @@ from needle_core.component import Diagnose, Log, Moment, Publish, Send
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.openigtlink import LinkMessage, LinkStream
 from needle_core.status_messages import ControllerStatus
+from plus_messages import message as link_message
 
 TIP = (0.001, 0.002, 0.04)
 TURN = Rotation.from_euler("xyz", (0.1, 0.2, 0.3))
@@ -168,7 +169,7 @@ def test_a_planners_target_is_proposed(name: str, points: Any, expected: Any, ve
         body = head + body + struct.pack(">HHHI", 1, 1, 3, 3) + b"kval"
     if version == 3:
         body = struct.pack(">HHII", 12, 0, 0, 7) + body
-    (message,) = LinkStream().split(packed_message("POINT", name, body, version))
+    (message,) = LinkStream().split(link_message("POINT", name, 1.0, body, version))
     component = OpenIGTLink(OpenIGTLinkParameters(port=0))
     actions = list(component.ports[0].handler((message,), AT))
     health = actions.pop()
@@ -202,34 +203,10 @@ def test_a_damaged_point_is_a_warning() -> None:
     assert not list(component.ports[0].handler((other,), AT))
 
 
-def test_messages_are_split_at_any_byte() -> None:
-    sent = [
-        ("POINT", "target", point_body("a", 1.0, 2.0, 3.0)),
-        ("STATUS", "x", b""),
-        ("A", "", b"9"),
-    ]
-    data = b"".join(packed_message(*each) for each in sent)
-    for size in (1, 7, 58, 1000):
-        stream = LinkStream()
-        parts = (data[at : at + size] for at in range(0, len(data), size))
-        found = [message for part in parts for message in stream.split(part)]
-        assert [(one.kind, one.name, one.body) for one in found] == sent
-        assert not stream.problem
-        assert not list(stream.split(packed_message("POINT", "t", b"", version=7)))
-        assert "version 7" in stream.problem
-        # The rest of the input is ignored.
-        assert not list(stream.split(data))
-
-
 def point_body(name: str, x: float, y: float, z: float) -> bytes:
     """Return a point as defined in http://openigtlink.org/protocols/v2_point.html."""
     text = (name.encode(), b"group", 255, 0, 0, 255, x, y, z, 1.0, b"owner")
     return struct.pack(">64s32s4B4f20s", *text)
-
-
-def packed_message(kind: str, name: str, body: bytes, version: int = 1) -> bytes:
-    head = (version, kind.encode(), name.encode(), 1, 2, len(body), 3)
-    return struct.pack(">H12s20sIIQQ", *head) + body
 
 
 def test_missing_pyigtl_is_an_error(

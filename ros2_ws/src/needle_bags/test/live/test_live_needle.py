@@ -44,9 +44,9 @@ def test_the_shaft_follows_the_path_of_the_tip() -> None:
 
 def test_a_withdrawn_needle_stays_on_its_path_until_it_is_out() -> None:
     trail = inserted()
-    way = trail.path
+    path = trail.path
     trail.add(0.03, arc(0.03))
-    assert np.array_equal(trail.path, way)
+    assert np.array_equal(trail.path, path)
     shaft = trail.shaft(0.03, arc(0.03))
     assert shaft[:, 2].max() == pytest.approx(arc(0.03)[2])
     assert 25 < len(shaft) < 32

@@ -61,15 +61,15 @@ class Viewer(Component):
     name = "viewer"
 
     def __init__(self, view: LiveView, topics: Iterable[str]) -> None:
-        self.seen: dict[str, list[Any]] = {topic: [] for topic in topics}
+        self.received: dict[str, list[Any]] = {topic: [] for topic in topics}
         self.inputs = tuple(
             Input(row.topic, row.message, partial(self._keep, row.topic), row.delivery)
             for row in view.outputs
-            if row.topic in self.seen
+            if row.topic in self.received
         )
 
     def _keep(self, topic: str, message: Any, at: Moment) -> Actions:
-        self.seen[topic].append(message)
+        self.received[topic].append(message)
         return ()
 
 
@@ -143,8 +143,8 @@ def shown(markers: m.Markers) -> dict[str, m.Marker]:
 
 def test_known_quantities_are_drawn_and_the_others_deleted() -> None:
     scene = Scene()
-    seen = scene.look_at(live_view.MARKERS, live_view.TIP, live_view.PATH).seen
-    markers = seen[live_view.MARKERS]
+    received = scene.look_at(live_view.MARKERS, live_view.TIP, live_view.PATH).received
+    markers = received[live_view.MARKERS]
     status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
     scene.say("needle/controller_status", status)
     assert set(shown(markers[-1])) == {"plane", "target_point"}
@@ -157,8 +157,8 @@ def test_known_quantities_are_drawn_and_the_others_deleted() -> None:
     assert there["plane"].position[0] == pytest.approx(0.003)
     assert there["plane"].frame_id == "rig"
     assert there["plane"].stamp_ns == pytest.approx(scene.runner.timeline.stamp_ns, abs=2e8)
-    assert seen[live_view.TIP][-1] == m.Pose(EXPOSED, "rig", TIP, UPRIGHT)
-    assert seen[live_view.PATH][-1].positions[-1] == TIP
+    assert received[live_view.TIP][-1] == m.Pose(EXPOSED, "rig", TIP, UPRIGHT)
+    assert received[live_view.PATH][-1].positions[-1] == TIP
     scene.say("needle/estimate", pose("target_plane", 2e-4))
     there = shown(markers[-1])
     assert there["estimate"].points[0] == pytest.approx((TIP[0] + 0.003, *TIP[1:]))
@@ -191,7 +191,7 @@ def test_topics_without_subscriber_are_not_published() -> None:
 
 def test_implausible_messages_are_rejected() -> None:
     scene = steered()
-    markers = scene.look_at(live_view.MARKERS).seen[live_view.MARKERS]
+    markers = scene.look_at(live_view.MARKERS).received[live_view.MARKERS]
     before = shown(markers[-1])
     for topic, message in (
         ("joint_states", inserted(1e300)),
@@ -235,13 +235,13 @@ def black(stamp_ns: int) -> m.Image:
 def test_an_image_is_drawn_with_its_answer(left_view: Projection) -> None:
     scene = steered()
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-    pictures = scene.look_at(LEFT).seen[LEFT]
+    pictures = scene.look_at(LEFT).received[LEFT]
     scene.rig.todo.append(Publish(RAW, black(2 * EXPOSED)))
     scene.say("needle/tip_pose", pose("rig", 1e-4, 2 * EXPOSED))
-    (seen,) = pictures
-    assert (seen.stamp_ns, seen.format) == (2 * EXPOSED, "jpeg")
-    assert seen.frame_id == "left_camera_optical"
-    picture = cv2.imdecode(np.frombuffer(seen.data, np.uint8), cv2.IMREAD_COLOR)
+    (received,) = pictures
+    assert (received.stamp_ns, received.format) == (2 * EXPOSED, "jpeg")
+    assert received.frame_id == "left_camera_optical"
+    picture = cv2.imdecode(np.frombuffer(received.data, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     camera = load_calibration(CALIBRATION).left
     assert picture.shape == (camera.height, camera.width, 3)
@@ -263,7 +263,7 @@ def test_images_of_another_camera_or_before_a_subscription_are_not_shown() -> No
     scene.runner.run(0.05)
     scene.runner.stop("viewer")
     scene.say(RAW, black(3))
-    pictures = scene.look_at(LEFT).seen[LEFT]
+    pictures = scene.look_at(LEFT).received[LEFT]
     scene.runner.run(1.0)
     assert pictures == []
     scene.say(RAW, m.Image(1, "", 2, 3, "mono8", 3, bytes(6)))
@@ -271,7 +271,7 @@ def test_images_of_another_camera_or_before_a_subscription_are_not_shown() -> No
     scene.say(RAW, black(4))
     scene.runner.run(1.0)
     assert [picture.stamp_ns for picture in pictures] == [4]
-    assert first.seen[LEFT] == []
+    assert first.received[LEFT] == []
 
 
 # ---- transforms
@@ -281,13 +281,13 @@ def test_transforms_are_published_if_the_message_type_is_installed() -> None:
     scene = Scene(transforms=True)
     assert Output(live_view.TF_STATIC, m.Transforms, LATCHED) in scene.view.outputs
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-    seen = scene.look_at(live_view.TF, live_view.TF_STATIC).seen
-    assert len(seen[live_view.TF_STATIC]) == 1
+    received = scene.look_at(live_view.TF, live_view.TF_STATIC).received
+    assert len(received[live_view.TF_STATIC]) == 1
     # Nothing is sent before there is data.
-    assert seen[live_view.TF] == []
+    assert received[live_view.TF] == []
     scene.say("needle/controller_status", ControllerStatus(target_offset_m=0.003))
     scene.say("needle/tip_pose", pose("rig", 1e-4))
-    plane, tip = seen[live_view.TF][-1].transforms
+    plane, tip = received[live_view.TF][-1].transforms
     assert (plane.child_frame_id, plane.translation) == ("target_plane", (0.003, 0.0, 0.0))
     assert tip == m.Transform(EXPOSED, "rig", "needle_tip", TIP, UPRIGHT)
 

@@ -85,15 +85,6 @@ def test_peers_read_the_needle_in_their_units() -> None:
     assert found["needle/measured_cp"].position == pytest.approx(TIP)
 
 
-def test_a_stamped_message_is_published_once() -> None:
-    bench = Bench(*read_peer_topics(FILE))
-    bench.insert()
-    bench.published()
-    assert bench.published().keys() == {"/needle/state/skin_entry"}
-    bench.insert(STAMP + 1_000_000)
-    assert bench.published()["/needle/state/current_shape"].stamp_ns == STAMP + 1_000_000
-
-
 STAGE: dict[str, Any] = {
     "unit": "mm",
     "frame": "stage",

@@ -89,8 +89,8 @@ def test_published_transforms_are_those_of_the_urdf(calibration: StereoCalibrati
     for one in published:
         x, y, z, w = one.rotation
         pose = transform_from_pq([*one.translation, w, x, y, z])
-        wanted = rig.get_transform(one.child_frame_id, one.frame_id)
-        np.testing.assert_allclose(pose, wanted, atol=1e-10)
+        expected = rig.get_transform(one.child_frame_id, one.frame_id)
+        np.testing.assert_allclose(pose, expected, atol=1e-10)
     # Each link of the URDF except the root has the same single parent.
     links = {one.child_frame_id: one.frame_id for one in published}
     attributes = joint_attributes(rig_urdf(calibration, LIMITS, 0.0009))

@@ -61,23 +61,23 @@ def test_the_foxglove_layout_has_the_published_topics() -> None:
     for name, panel in layout["configById"].items():
         match name.partition("!")[0]:
             case "3D":
-                wanted = {topic: set(RVIZ.values()) - {PICTURE} for topic in panel["topics"]}
+                required = {topic: set(RVIZ.values()) - {PICTURE} for topic in panel["topics"]}
             case "Image":
-                wanted = {panel["imageMode"]["imageTopic"]: {PICTURE}}
+                required = {panel["imageMode"]["imageTopic"]: {PICTURE}}
             case "Plot":
-                ways = [path["value"].partition("[")[0].split(".") for path in panel["paths"]]
-                wanted = {topic: {there[topic]} for topic, *_ in ways}
-                for topic, *fields in ways:
+                paths = [path["value"].partition("[")[0].split(".") for path in panel["paths"]]
+                required = {topic: {there[topic]} for topic, *_ in paths}
+                for topic, *fields in paths:
                     message = message_class(there[topic])()
                     for field in fields:
                         message = getattr(message, field)
             case "RawMessages":
-                wanted = {panel["topicPath"]: {there[panel["topicPath"]]}}
+                required = {panel["topicPath"]: {there[panel["topicPath"]]}}
             case kind:
                 assert kind == "DiagnosticSummary"
-                wanted = {panel["topicToRender"]: {"diagnostic_msgs/msg/DiagnosticArray"}}
-        assert all(there[topic] in kinds for topic, kinds in wanted.items())
-        shown |= wanted.keys()
+                required = {panel["topicToRender"]: {"diagnostic_msgs/msg/DiagnosticArray"}}
+        assert all(there[topic] in kinds for topic, kinds in required.items())
+        shown |= required.keys()
     assert OUTPUTS.keys() <= shown
     # Foxglove shows all of it over the port as well.
     assert {topic: there[topic] for topic in shown} == {topic: CHANNELS[topic] for topic in shown}

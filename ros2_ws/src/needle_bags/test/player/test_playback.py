@@ -64,8 +64,8 @@ def test_other_topics_keep_their_names_unless_the_new_one_controls_a_rig() -> No
         assert played_name(name, POINT, {}) == name
         assert played_name(name, POINT, {}, beside_rig=True) == f"/replay{name}"
     remaps = {"/needle/pose": "/target_plane", "/flag": "/device/estop"}
-    for name, wanted in remaps.items():
-        assert played_name(name, POINT, remaps) == f"/replay{wanted}"
+    for name, requested in remaps.items():
+        assert played_name(name, POINT, remaps) == f"/replay{requested}"
     assert marks_a_rig("/bench/device/status")
     assert not marks_a_rig("/replay/device/status")
 

@@ -4,12 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
+from made_up_run import header, serialized
 from needle_bags.format.bag_writer import BagWriter, stamp_of, standard_topic
 from needle_bags.reading.bag_messages import raw_as_sent
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPE, IMAGE = "std_msgs/msg/Header", "sensor_msgs/msg/Image"
 MILLISECOND = 1_000_000
 START = 1_700_000_000_000_000_000
@@ -27,9 +26,7 @@ def write(directory: Path, delay_of: Callable[[str, int], int], *, count: int = 
             sent = START + (10 * number + place) * MILLISECOND
             messages.append((sent + delay_of(name, number), sent, name))
     for received, sent, name in sorted(messages):
-        stamp = STORE.types["builtin_interfaces/msg/Time"](sec=0, nanosec=(sent - START) % 10**9)
-        data = bytes(STORE.serialize_cdr(STORE.types[TYPE](stamp=stamp, frame_id=name), TYPE))
-        bag.write(name, data, received, sent)
+        bag.write(name, serialized(header(sent - START, name)), received, sent)
     bag.close()
 
 

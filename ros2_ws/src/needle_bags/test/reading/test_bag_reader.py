@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from made_up_run import copy_messages
 from needle_bags.format.bag_writer import BagCopy, BagWriter, standard_topic, string_message
-from needle_bags.reading.bag_messages import raw_as_sent, read_contents
 from needle_bags.reading.bag_reader import _health_events, _series, read_run
 from needle_core.errors import UserError
 from needle_core.files.bag_topic import BagTopic
@@ -29,9 +29,7 @@ def two_rigs(make_run: MakeRun, tmp_path: Path) -> Path:
     """A bag of a rig without a namespace and of a shorter run of one in /bench."""
     copy = BagCopy(tmp_path / "two", "jazzy", {})
     for bag in (make_run("one", steps=30), make_run("other", namespace="/bench/", steps=20)):
-        contents = read_contents(bag)
-        for m in raw_as_sent(bag, lambda _: True):
-            copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
+        copy_messages(bag, copy)
     copy.close()
     return tmp_path / "two"
 
@@ -82,8 +80,8 @@ def test_holds_of_two_sessions_are_stamped_by_arrival() -> None:
 def test_insertion_is_interpolated(make_run: MakeRun) -> None:
     run = read_run(make_run(steps=20))
     middle = (run.joints.stamps[:-1] + run.joints.stamps[1:]) // 2
-    wanted = (np.arange(20) + 0.5) * 1e-3
-    np.testing.assert_allclose(run.insertion_at(middle), wanted, atol=1e-12)
+    expected = (np.arange(20) + 0.5) * 1e-3
+    np.testing.assert_allclose(run.insertion_at(middle), expected, atol=1e-12)
 
 
 def foreign(path: Path) -> None:

@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
+from made_up_run import header, message
 from needle_bags.reading import frames
 from needle_bags.reading.bag_reader import Series, read_run
 from needle_bags.reading.frames import read_frames
 from needle_core.errors import UserError
 
 BAG = Path(__file__).parents[5] / "bags" / "regression"
-TYPES = get_typestore(Stores.ROS2_JAZZY).types
 POSE = [f"position.{axis}" for axis in "xyz"] + [f"orientation.{axis}" for axis in "xyzw"]
 
 
@@ -39,14 +38,14 @@ def test_rows_agree_with_the_typed_reader(rows: dict[str, list[dict[str, Any]]])
     def table(topic: str, columns: Sequence[str]) -> np.ndarray:
         return np.array([[row[name] for name in columns] for row in rows[topic]], float)
 
-    wanted: dict[str, tuple[Series, list[str]]] = {
+    columns_of: dict[str, tuple[Series, list[str]]] = {
         "/needle/tip": (run.tips, [f"point.{axis}" for axis in "xyz"]),
         "/sim/tip_pose": (run.truth, [f"pose.{name}" for name in POSE]),
         "/needle/estimate": (run.estimate, [f"pose.pose.{name}" for name in POSE]),
         "/joint_states": (run.joints, joints),
         "/device/joint_trajectory": (run.commands, commands),
     }
-    for topic, (series, columns) in wanted.items():
+    for topic, (series, columns) in columns_of.items():
         found = table(topic, ["stamp", "received", *columns])
         # The typed reader keeps only the first of several equal stamps.
         _, first = np.unique(found[:, 0], return_index=True)
@@ -78,18 +77,13 @@ def test_missing_dependencies_and_topics_are_named(monkeypatch: pytest.MonkeyPat
         read_frames(BAG, ["/needle/top"])
 
 
-def message(kind: str, **fields: Any) -> Any:
-    return TYPES[kind](**fields)
-
-
 def test_health_has_a_row_for_each_status_and_points_have_their_joints_names() -> None:
-    stamp = message("builtin_interfaces/msg/Time", sec=3, nanosec=500_000_000)
-    header = message("std_msgs/msg/Header", stamp=stamp, frame_id="rig")
+    begin = header(3_500_000_000)
     pair = message("diagnostic_msgs/msg/KeyValue", key="rate_hz", value="30")
     fields = {"message": "well", "hardware_id": "", "values": [pair]}
     kind = "diagnostic_msgs/msg/DiagnosticStatus"
     parts = [message(kind, level=k, name=f"part {k}", **fields) for k in (0, 1)]
-    health = message("diagnostic_msgs/msg/DiagnosticArray", header=header, status=parts)
+    health = message("diagnostic_msgs/msg/DiagnosticArray", header=begin, status=parts)
     first, second = frames._rows(health)
     assert first["stamp"] == second["stamp"] == 3.5
     assert (second["level"], second["name"], second["values.rate_hz"]) == (1, "part 1", "30")
@@ -100,7 +94,7 @@ def test_health_has_a_row_for_each_status_and_points_have_their_joints_names() -
     point = message(kind, positions=place, time_from_start=after, **nothing)
     names = ["insertion_joint", "rotation_joint"]
     kind = "trajectory_msgs/msg/JointTrajectory"
-    (row,) = frames._rows(message(kind, header=header, joint_names=names, points=[point] * 2))
+    (row,) = frames._rows(message(kind, header=begin, joint_names=names, points=[point] * 2))
     each = {"insertion_joint": 1.0, "rotation_joint": 10.0}
     assert row == {
         **{"stamp": 3.5, "header.frame_id": "rig"},

@@ -175,7 +175,7 @@ def test_an_interrupted_recovery_can_be_repeated(
     damage(path / "bag_1.mcap")
     before = contents(path)
     shutil.copytree(path, tmp_path / "other" / "bag")
-    wanted = recover_bag(tmp_path / "other" / "bag")
+    expected = recover_bag(tmp_path / "other" / "bag")
     act = getattr(bag_recovery, step)
     # Interrupt the first, second, ... call.
     for calls in range(100):
@@ -199,8 +199,8 @@ def test_an_interrupted_recovery_can_be_repeated(
         assert before["bag_1.mcap"] in contents(path).values()
         monkeypatch.setattr(bag_recovery, step, act)
         recover_bag(path)
-        assert numbers(path) == list(range(wanted.messages))
-        assert read_contents(path).custom_data["recovered"].startswith(wanted.lost)
+        assert numbers(path) == list(range(expected.messages))
+        assert read_contents(path).custom_data["recovered"].startswith(expected.lost)
 
 
 @pytest.mark.parametrize("compression", ["none", "zstd"])

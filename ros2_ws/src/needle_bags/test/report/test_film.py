@@ -46,13 +46,13 @@ def test_frames_are_equally_spaced_and_end_at_their_tip(made_up: Run) -> None:
     assert depths == [2.0 * number for number in range(MAX_FRAMES)]
     nothing = Series(made_up.truth.stamps[:0], made_up.truth.values[:0], made_up.truth.stamps[:0])
     blind = film_of(dataclasses.replace(made_up, truth=nothing))
-    for frame, seen in zip(frames[1:], blind[1:], strict=True):
+    for frame, measured in zip(frames[1:], blind[1:], strict=True):
         here = made_up.truth.stamps == frame.stamp
         assert np.array_equal(frame.needle[-1], made_up.truth.values[here, :3][0])
         tip = made_up.tips.values[made_up.tips.stamps == frame.stamp][0]
         assert np.array_equal(frame.shaft[-1], tip)
         # Without ground truth, the measured tip is shown.
-        assert np.array_equal(seen.needle, frame.shaft)
+        assert np.array_equal(measured.needle, frame.shaft)
 
 
 def test_a_resting_needle_takes_no_frames(made_up: Run) -> None:
@@ -112,12 +112,12 @@ def test_the_film_marks_the_tip_in_camera_images(
     stamps = np.array([frame.stamp for frame in frames])
     assert len(film["readings"]) == len(frames) == len(set(stamps.tolist()))
     images = {(index, side): image for index, side, image in images_at(run, stamps)}
-    seen_by, checked = projections(run), 0
+    projection_of, checked = projections(run), 0
     for view, side in zip(film["views"], ("left", "right"), strict=False):
         assert decoded(base64.b64decode(view["pictures"][0])).size
         for index, line in enumerate(view["lines"]):
             u, v = (float(part) for part in line.split(" ")[-1].split(","))
-            measured = seen_by[side](frames[index].shaft)[-1]
+            measured = projection_of[side](frames[index].shaft)[-1]
             assert (u, v) == pytest.approx(measured.tolist(), abs=0.051)
             image = images[index, side]
             near = image[int(v) - 6 : int(v) + 7, int(u) - 6 : int(u) + 7]

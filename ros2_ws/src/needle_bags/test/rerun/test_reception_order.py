@@ -3,31 +3,25 @@ from __future__ import annotations
 from functools import partial
 
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
+from made_up_run import header, serialized, status
 from needle_bags.reading.bag_messages import SentMessage
 from needle_bags.rerun.bag_pass import in_reception_order
 from needle_controller.controller_status import ReceptionLog
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 HEADER, STATUS = "std_msgs/msg/Header", "diagnostic_msgs/msg/DiagnosticStatus"
-PAIR = STORE.types["diagnostic_msgs/msg/KeyValue"]
 
 
 def sent(time: int, topic: str) -> SentMessage:
-    stamp = STORE.types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    data = bytes(STORE.serialize_cdr(STORE.types[HEADER](stamp=stamp, frame_id=""), HEADER))
-    return SentMessage(time, time, f"/rig/{topic}", HEADER, data)
+    return SentMessage(time, time, f"/rig/{topic}", HEADER, serialized(header(0)))
 
 
-def status(time: int, *heard: tuple[str, int]) -> SentMessage:
+def heard_by(time: int, *heard: tuple[str, int]) -> SentMessage:
     """Return a controller status; `("joints", 7)`: it had received the joints sent at 7."""
     told = ReceptionLog()
     for topic, sent_ns in heard:
         told.add(topic, sent_ns)
-    values = [PAIR(key="heard", value=told.pop_text())]
-    message = STORE.types[STATUS](level=0, name="", message="", hardware_id="", values=values)
-    data = bytes(STORE.serialize_cdr(message, STATUS))
+    data = serialized(status({"heard": told.pop_text()}))
     return SentMessage(time, time, "/rig/needle/controller_status", STATUS, data)
 
 
@@ -41,22 +35,22 @@ SENT = partial(map, lambda pair: sent(*pair))
         (  # The order is that of reception.
             [
                 *SENT([(10, J), (11, "result"), (12, "tip"), (20, J)]),
-                *(status(30, ("tip", 12), (J, 10)), sent(40, J)),
-                status(50, (J, 20), ("result", 11), (J, 40)),
+                *(heard_by(30, ("tip", 12), (J, 10)), sent(40, J)),
+                heard_by(50, (J, 20), ("result", 11), (J, 40)),
             ],
             [("tip", 12), (J, 10), (S, 30), (J, 20), ("result", 11), (J, 40), (S, 50)],
         ),
         (  # Messages that the last status lacks were received after it.
-            [*SENT([(10, J), (15, J), (16, X)]), status(20, (J, 10)), sent(30, J)],
+            [*SENT([(10, J), (15, J), (16, X)]), heard_by(20, (J, 10)), sent(30, J)],
             [(J, 10), (X, 16), (S, 20), (J, 15), (J, 30)],
         ),
         # Without such statuses, the order is that of sending.
-        ([status(20), sent(10, J)], [(J, 10), (S, 20)]),
+        ([heard_by(20), sent(10, J)], [(J, 10), (S, 20)]),
         (  # An unlisted message older than the last received one was never received.
             [
                 *SENT([(10, J), (11, X), (20, J)]),
-                *(status(25, (J, 20)), *SENT([(30, J), (40, J)])),
-                *(status(45, (J, 40)), sent(50, J)),
+                *(heard_by(25, (J, 20)), *SENT([(30, J), (40, J)])),
+                *(heard_by(45, (J, 40)), sent(50, J)),
             ],
             [(X, 11), (J, 20), (S, 25), (J, 40), (S, 45), (J, 50)],
         ),

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import yaml
 from rclpy.parameter import Parameter
-from rosbags.typesys import Stores, get_typestore
 
+from made_up_run import STORE, copy_messages, header, message, serialized
 from needle_bags.format.bag_writer import BagCopy, standard_topic, string_message
 from needle_bags.link import openigtlink
 from needle_bags.live import live_view
@@ -25,11 +25,11 @@ from needle_bags.rerun.rerun_bag import TABLE, write_rerun
 from needle_bags.rerun.stages import Output
 from needle_bags.ros import rerun as rerun_node
 from needle_core.errors import UserError
+from needle_core.files.bag_topic import BagTopic
 from needle_tracker.optics.calibration import StereoCalibration, parse_calibration
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 PICTURES = live_view.PICTURES.values()
-EVENT = "rcl_interfaces/msg/ParameterEvent"
+EVENT, TEXT = "rcl_interfaces/msg/ParameterEvent", "std_msgs/msg/String"
 
 Capture = pytest.CaptureFixture[str]
 
@@ -208,47 +208,39 @@ def test_recorded_viewer_topics_are_replaced(shown: tuple[Path, str], shown_agai
     assert "openigtlink: left out, pyigtl is not installed" in said
 
 
-def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: str) -> Any:
-    """Copy a bag with other custom data; the context yields a function to prepend messages."""
-    contents = read_contents(bag)
-    copy, new = BagCopy(target, "jazzy", custom), standard_topic(topic, kind)
-
-    @contextlib.contextmanager
-    def writing() -> Iterator[Callable[[bytes], None]]:
-        yield lambda data: copy.put(new, data, contents.start, contents.start)
-        for m in raw_as_sent(bag, lambda _: True):
-            copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
-        copy.close()
-
-    return writing()
+def copied(bag: Path, target: Path, custom: dict[str, str], topic: BagTopic, first: bytes) -> None:
+    """Copy a bag with other custom data, after a message of a new topic."""
+    copy, start = BagCopy(target, "jazzy", custom), read_contents(bag).start
+    copy.put(topic, first, start, start)
+    copy_messages(bag, copy)
+    copy.close()
 
 
 def test_announced_parameters_are_sufficient(eight_steps: Path, tmp_path: Path) -> None:
     """A bag of ROS 2's own recorder has no custom data, but /parameter_events."""
-    with copied(eight_steps, tmp_path / "bag", {}, "/parameter_events", EVENT) as put:
-        node = "/plane_controller"
-        put(event(node, read_run(eight_steps).parameters[node]))
+    node = "/plane_controller"
+    announced = event(node, read_run(eight_steps).parameters[node])
+    topic = standard_topic("/parameter_events", EVENT)
+    copied(eight_steps, tmp_path / "bag", {}, topic, serialized(announced))
     assert rerun(tmp_path / "bag") == 0
 
 
-def event(node: str, parameters: dict[str, Any]) -> bytes:
-    """Return the ParameterEvent of a node at its start, as CDR."""
-    types = STORE.types
+def event(node: str, parameters: dict[str, Any]) -> Any:
+    """Return the ParameterEvent of a node at its start."""
     kinds = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np.float64}
 
     def value(content: Any) -> Any:
-        message = Parameter("", value=content).get_parameter_value()
-        fields = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
+        made = Parameter("", value=content).get_parameter_value()
+        fields = {name: getattr(made, name) for name in made.get_fields_and_field_types()}
         for kind, numbers in kinds.items():
             # rclpy has lists; rosbags requires arrays.
             name = f"{kind}_array_value"
             fields[name] = np.array(fields[name], numbers)
-        return types["rcl_interfaces/msg/ParameterValue"](**fields)
+        return message("rcl_interfaces/msg/ParameterValue", **fields)
 
-    parameter = types["rcl_interfaces/msg/Parameter"]
+    parameter = STORE.types["rcl_interfaces/msg/Parameter"]
     new = [parameter(name, value(content)) for name, content in parameters.items()]
-    stamp = types["builtin_interfaces/msg/Time"](1, 0)
-    return bytes(STORE.serialize_cdr(types[EVENT](stamp, node, new, [], []), EVENT))
+    return STORE.types[EVENT](header(10**9).stamp, node, new, [], [])
 
 
 def test_the_calibration_is_that_of_the_tracker_or_of_params(
@@ -256,11 +248,8 @@ def test_the_calibration_is_that_of_the_tracker_or_of_params(
 ) -> None:
     """The tracker publishes it on its own topic, so the recorder needs no setting."""
     text = read_run(eight_steps).calibration
-    bag, kind = tmp_path / "bag", "std_msgs/msg/String"
-    with copied(
-        eight_steps, bag, {"calibration": "left: {}"}, "/stereo_tracker/calibration", kind
-    ) as put:
-        put(string_message(text))
+    bag, topic = tmp_path / "bag", standard_topic("/stereo_tracker/calibration", TEXT)
+    copied(eight_steps, bag, {"calibration": "left: {}"}, topic, string_message(text))
     run = read_run(bag)
     assert run.calibration == text
     other = tmp_path / "other.yaml"
@@ -268,17 +257,17 @@ def test_the_calibration_is_that_of_the_tracker_or_of_params(
     changed["phantom"]["refractive_index"] += 0.01
     other.write_text(yaml.safe_dump(changed))
     file = given(tmp_path, f"calibration_file: {other}", "stereo_tracker")
-    seen: list[str] = []
+    used_texts: list[str] = []
 
     def stop(_: object, __: object, used: str) -> None:
-        seen.append(used)
+        used_texts.append(used)
         raise UserError("seen")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rerun_node, "_tracker", stop)
         for arguments in ((), ("--params", file)):
             assert rerun(first_pictures, *arguments) == 2
-    assert seen == [text, other.read_text()]
+    assert used_texts == [text, other.read_text()]
 
 
 def test_bad_input_gives_a_one_line_error(

@@ -19,13 +19,13 @@ def test_summary_of_a_known_run(made_up: Run) -> None:
     summary = summarize(made_up, wall_s=12.5)
     depth = np.arange(100, 121) / 120
     r1 = -0.25 + (-2.75) * (1 + np.cos(np.pi * depth)) / 2
-    wanted = {
+    expected = {
         **{"r1_initial_mm": -3.0, "r1_final_mm": -0.25, "insertion_final_mm": 120.0},
         **{"tip_error_p95_mm": 0.5, "depth_error_p95_mm": 0.3, "steps_per_s": 20.0},
         "rotation_total_deg": math.degrees(12.0),
         "r1_rms_last_20_mm": float(np.sqrt(np.mean(r1**2))),
     }
-    assert {key: summary[key] for key in wanted} == pytest.approx(wanted)
+    assert {key: summary[key] for key in expected} == pytest.approx(expected)
     told = {"level": "tip", "controller": "paper", "seed": 7, "steps": 120, "wall_s": 12.5}
     assert {key: summary[key] for key in told} == told
     assert (summary["watchdog_trips"], summary["converged"]) == (3, True)

@@ -5,12 +5,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
+from made_up_run import header, serialized, status
 from needle_bags.format.bag_writer import BagCopy, standard_topic
 from needle_bags.run.stage_timing import stage_timings
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 # Every message of a step begins with its stamp; the timing uses nothing else.
 HEADER = "std_msgs/msg/Header"
 MILLISECOND = 1_000_000
@@ -21,23 +20,16 @@ STEPS = 25
 
 LEFT, RIGHT = "stereo/left/camera_info", "stereo/right/camera_info"
 STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
-KEY_VALUE = "diagnostic_msgs/msg/KeyValue"
 
 
 def put(bag: BagCopy, topic: str, stamp: int, sent: int, received: int) -> None:
     """Write a message with a stamp."""
-    time = STORE.types["builtin_interfaces/msg/Time"](
-        sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000
-    )
-    data = bytes(STORE.serialize_cdr(STORE.types[HEADER](stamp=time, frame_id=""), HEADER))
-    bag.put(standard_topic(f"/rig/{topic}", HEADER), data, received, sent)
+    bag.put(standard_topic(f"/rig/{topic}", HEADER), serialized(header(stamp)), received, sent)
 
 
 def put_status(bag: BagCopy, heard: int, sent: int, received: int) -> None:
     """Write a status: the device has received commands up to this stamp."""
-    values = [STORE.types[KEY_VALUE](key="command_ns", value=str(heard))]
-    message = STORE.types[STATUS](level=0, name="", message="", hardware_id="", values=values)
-    data = bytes(STORE.serialize_cdr(message, STATUS))
+    data = serialized(status({"command_ns": heard}))
     bag.put(standard_topic("/rig/device/status", STATUS), data, received, sent)
 
 

@@ -115,7 +115,7 @@ class HoldProtocol:
             "count": self._count,
             "heard": entry.session.echoed,
             "held": entry.session.state(now).pressed,
-            "bar": self._bar(page, now),
+            "bar": self._watch_only_reason(page, now),
             "why": entry.why,
         }
         return json.dumps(fields)
@@ -166,8 +166,8 @@ class HoldProtocol:
         except ValueError:
             entry.session.end()
             return HoldRefusal.INVALID
-        bar = self._bar(page, now)
-        refusal = entry.session.receive(count, hold, now, may_hold=not bar)
+        reason = self._watch_only_reason(page, now)
+        refusal = entry.session.receive(count, hold, now, may_hold=not reason)
         holds = entry.session.state(now).pressed
         if holds:
             self._owner = page
@@ -176,10 +176,10 @@ class HoldProtocol:
             entry.why = ""
         elif refusal is not None:
             # Keep the first reason until the button is released.
-            entry.why = entry.why or (bar if refusal is HoldRefusal.BARRED else refusal.value)
+            entry.why = entry.why or (reason if refusal is HoldRefusal.BARRED else refusal.value)
         return refusal
 
-    def _bar(self, page: int, now: float) -> str:
+    def _watch_only_reason(self, page: int, now: float) -> str:
         """Return the reason why a page may only watch and stop; empty if it may hold."""
         if why := self._why_not(self._pages[page].is_local):
             return why

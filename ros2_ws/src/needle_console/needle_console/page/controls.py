@@ -37,7 +37,7 @@ class Controls:
     def __init__(self, port: PagePort) -> None:
         self._port = port
         # A page may only watch until its hold is connected.
-        self._bar = "no hold: not connected"
+        self._watch_only_reason = "no hold: not connected"
         self._buttons: dict[Button, Any] = {}
         self._proposal = np.zeros(3)  # as shown [mm]
         with ui.element("section").classes("controls").props('aria-label="Controls"'):
@@ -53,7 +53,7 @@ class Controls:
                     self._add_button(button)
             self._answer = ui.label().classes("answer").props('role="status"')
             self._build_targets()
-        ui.on("hold_bar", self._on_bar)
+        ui.on("hold_bar", self._on_watch_only)
 
     def show(self, snapshot: Snapshot) -> None:
         """Show the next step, and enable the buttons that have an effect."""
@@ -71,7 +71,7 @@ class Controls:
         why = stop_reason(device) if device is not None and must_release else ""
         self._not_counted.set_text(f"ignored by the device: {why}" if why else "")
         for button, element in self._buttons.items():
-            usable = button in possible and not self._bar
+            usable = button in possible and not self._watch_only_reason
             if button not in _HOLDS:
                 element.set_enabled(usable)
             # Hold buttons are never disabled, because one may be pressed at the moment.
@@ -129,8 +129,8 @@ class Controls:
 
     def _add_target(self, name: str, send: Callable[[], None]) -> ui.button:
         def set_target() -> None:
-            if self._bar:
-                ui.notify(self._bar)
+            if self._watch_only_reason:
+                ui.notify(self._watch_only_reason)
                 return
             try:
                 send()
@@ -141,11 +141,11 @@ class Controls:
         return button.props("no-caps unelevated")
 
     def _press(self, button: Button) -> None:
-        if not self._bar:
+        if not self._watch_only_reason:
             self._port.press(button)
 
-    def _on_bar(self, event: events.GenericEventArguments) -> None:
-        self._bar = str(event.args)
+    def _on_watch_only(self, event: events.GenericEventArguments) -> None:
+        self._watch_only_reason = str(event.args)
 
 
 def _number(label: str, value: float) -> ui.number:

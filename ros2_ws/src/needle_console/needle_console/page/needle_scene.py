@@ -56,31 +56,31 @@ class NeedleScene:
         """Show the target point, or the target plane if there is none."""
         point = snapshot.controller.target_point_m if snapshot.controller is not None else None
         centre, rotation = plane_centre(snapshot, _LENGTH), plane_rotation(snapshot)
-        wanted = [centre, rotation] if point is None else [to_view(np.array(point))]
-        if not self._is_new("target", *wanted):
+        placement = [centre, rotation] if point is None else [to_view(np.array(point))]
+        if not self._is_new("target", *placement):
             return
         if self._target is not None:
             self._target.delete()
         with self._scene as scene:
             if point is not None:
                 self._target = scene.sphere(_TARGET_MM).material(ORANGE)
-                self._target.move(*_floats(wanted[0]))
+                self._target.move(*_floats(placement[0]))
             else:
                 self._target = _grid(scene).move(*_floats(centre)).rotate_R(rotation.tolist())
 
     def _show_shaft(self, points: Array) -> None:
-        ends = [(*_floats(a), *_floats(b)) for a, b in pairwise(points)]
+        pieces = [(*_floats(a), *_floats(b)) for a, b in pairwise(points)]
         same = 0
-        for (sent, _), wanted in zip(self._pieces, ends, strict=False):
-            if sent != wanted:
+        for (sent, _), ends in zip(self._pieces, pieces, strict=False):
+            if sent != ends:
                 break
             same += 1
         for _, piece in self._pieces[same:]:
             piece.delete()
         del self._pieces[same:]
         with self._scene as scene:
-            for wanted in ends[same:]:
-                self._pieces.append((wanted, _piece(scene, np.array(wanted).reshape(2, 3))))
+            for ends in pieces[same:]:
+                self._pieces.append((ends, _piece(scene, np.array(ends).reshape(2, 3))))
 
     def _show_uncertainty(self, snapshot: Snapshot) -> None:
         found = ellipsoid(snapshot)

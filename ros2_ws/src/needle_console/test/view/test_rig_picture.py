@@ -19,7 +19,7 @@ STEERING = ControllerStatus(state="STEERING", starts=1, target_offset_m=0.003)
 MINUS, NONE = "\N{MINUS SIGN}", "\N{EN DASH}"
 
 
-def seen(*depths: float) -> RigPicture:
+def picture_of(*depths: float) -> RigPicture:
     picture = RigPicture()
     picture.set_controller(STEERING)
     for depth in depths:
@@ -29,18 +29,18 @@ def seen(*depths: float) -> RigPicture:
 
 
 def test_outdated_joints_are_not_shown() -> None:
-    picture = seen(0.01)
+    picture = picture_of(0.01)
     assert picture.snapshot(0.9).insertion == 0.01
     assert math.isnan(picture.snapshot(1.1).insertion)
     assert readings(picture.snapshot(1.1))["Depth"] == NONE
 
 
 def test_estimates_are_transformed_by_the_current_plane() -> None:
-    (point,) = seen(0.05).snapshot(0.0).track
+    (point,) = picture_of(0.05).snapshot(0.0).track
     assert point.r1 == pytest.approx(-0.002)
     assert point.position == pytest.approx([0.001, 0.0, 0.05])
     assert point.sigma == pytest.approx(1e-4)
-    picture = seen()
+    picture = picture_of()
     picture.set_plane(plane_pose(3.0, 30.0))
     picture.set_joints(0.05, 0.1, now=0.0)
     # On the plane, 50 mm along it.
@@ -53,7 +53,7 @@ def test_estimates_are_transformed_by_the_current_plane() -> None:
 
 
 def test_plane_is_shown_only_if_the_controller_accepted_it() -> None:
-    picture = seen(0.01)
+    picture = picture_of(0.01)
     tilted = plane_pose(9.0, 36.0)
     picture.set_plane(tilted)
     assert picture.snapshot(0.0).T_rig_plane[0, 3] == pytest.approx(0.003)
@@ -81,7 +81,7 @@ def test_reason_of_an_ended_hold_is_kept_while_pressed() -> None:
 
 
 def test_missing_controller_is_cleared() -> None:
-    picture = seen(0.01)
+    picture = picture_of(0.01)
     picture.clear_controller()
     assert picture.latest().controller is None
     picture.set_controller(STEERING)
@@ -89,7 +89,7 @@ def test_missing_controller_is_cleared() -> None:
 
 
 def test_track_deepens_and_restarts() -> None:
-    picture = seen(0.010, 0.011, 0.0111, 0.012)
+    picture = picture_of(0.010, 0.011, 0.0111, 0.012)
     assert [point.depth for point in picture.snapshot(0.0).track] == [0.010, 0.0111, 0.012]
     picture.set_joints(0.0105, 0.1, now=0.0)
     assert len(picture.snapshot(0.0).shaft) == 2
@@ -100,7 +100,7 @@ def test_track_deepens_and_restarts() -> None:
 
 
 def test_age_of_a_lost_or_old_tip() -> None:
-    picture = seen(0.01)
+    picture = picture_of(0.01)
     picture.set_tip(np.array([0.0, -0.001, 0.01]), COVARIANCE, now=1.0)
     for now, text in ((1.5, f"0.0, {MINUS}1.0, 10.0 mm"), (2.9, "no images for 2 s")):
         assert readings(picture.snapshot(now))["Tip"] == text
@@ -111,7 +111,7 @@ def test_age_of_a_lost_or_old_tip() -> None:
 
 
 def test_non_finite_values_are_ignored() -> None:
-    picture = seen(0.01)
+    picture = picture_of(0.01)
     before = picture.snapshot(0.5)
     picture.set_joints(math.nan, 0.0, now=0.5)
     picture.add_estimate(np.array([math.inf, 0.0, 0.0]), COVARIANCE)
@@ -134,7 +134,7 @@ def test_warnings_end_when_resolved_or_outdated() -> None:
 
 def test_readings_are_in_mm_and_degrees() -> None:
     assert set(readings(Snapshot(DeviceStatus(), ControllerStatus())).values()) == {NONE}
-    picture = seen(0.05)
+    picture = picture_of(0.05)
     told = dataclasses.replace(STEERING, depth_m=0.12, r1_low_m=-0.0025, r1_high_m=-0.0015)
     picture.set_controller(dataclasses.replace(told, reachable=True, reachable_depth_m=0.043))
     shown = readings(picture.snapshot(0.0))

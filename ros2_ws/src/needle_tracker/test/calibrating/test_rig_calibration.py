@@ -34,7 +34,7 @@ from synthetic_rig import (
     changed,
     free_pose,
     lenses_of,
-    seen,
+    pixels_of,
     take,
     view_of,
 )
@@ -45,7 +45,7 @@ RIGS = pytest.mark.parametrize(("rigs", "found"), [("rig", "result"), ("box_rig"
 def tip_error(rig: StereoRig, calibration: StereoCalibration) -> float:
     """Return the 95th percentile of the errors of noise-free tips all over the phantom [m]."""
     points = needle_points(calibration)
-    left, right = (seen(camera, points, True) for camera in (rig.left, rig.right))
+    left, right = (pixels_of(camera, points, True) for camera in (rig.left, rig.right))
     errors = np.linalg.norm(measured_points(calibration, left, right) - points, axis=-1)
     return float(np.percentile(errors, 95.0))
 

@@ -1,9 +1,6 @@
-"""Writes the reference into a folder: `python -m reference.write FOLDER`, from scripts/lib."""
+"""All pages of the reference."""
 
 from __future__ import annotations
-
-import sys
-from pathlib import Path
 
 from reference.command_pages import commands_page
 from reference.diagnostic_pages import diagnostics_page
@@ -23,16 +20,3 @@ def pages() -> dict[str, str]:
         "commands.md": commands_page(nodes),
         **{f"{NODES}{node.name}.md": node_page(node) for node in nodes},
     }
-
-
-def main() -> None:
-    """Write the pages."""
-    folder = Path(sys.argv[1])
-    for name, text in pages().items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
