@@ -91,7 +91,6 @@ REFUSED: list[tuple[Change, str]] = [
     ),
     (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x06")), "write 8 to 0x6060:0 mode"),
     (makes(0x1016, 127 << 16 | 100, 0), "0x1016:1 consumer heartbeat time but reads back 0"),
-    (lacks(0x1017), "refuses to write 30 to 0x1017:0"),
     (all_of(tells({(0x1017, 0): 0}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     (all_of(tells({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     (refuses(RANGE, 0x605A), "node 1 refuses to write 6 to 0x605A:0"),
