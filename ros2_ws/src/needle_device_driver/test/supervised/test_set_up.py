@@ -261,25 +261,6 @@ def test_parameters_override_reported_units() -> None:
     assert bench.rotation.value(0x6085) == 955
 
 
-def test_new_set_up_needs_a_new_homing() -> None:
-    bench = DriveBench().homed()
-    assert bench.run(bench.supervisor.deconfigure()).success
-    bench.configured()
-    assert not bench.is_homed()
-
-
-def test_rebooted_drive_reports_its_units_again() -> None:
-    bench = DriveBench()
-    bench.insertion.set_objects(IN_RPM)
-    bench.configured()
-    assert bench.insertion.value(0x6085) == 30_000
-    bench.insertion.set_objects({(0x608F, 1): 10_000})
-    bench.after(bench.insertion.reboot)
-    bench.hold(False)
-    assert bench.reset().success
-    assert bench.insertion.value(0x6085) == 60_000
-
-
 def test_homing_method_35_replaces_37() -> None:
     bench = DriveBench()
     refuses(RANGE, 0x6098, but=b"\x23")(bench.rotation)
@@ -330,16 +311,6 @@ def test_drive_that_refuses_its_limits_is_not_switched_on() -> None:
     bench.wait()
     assert bench.state == "FAULT"
     assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
-
-
-def test_nothing_is_switched_on_before_the_limits_are_written() -> None:
-    bench = DriveBench().homing()
-    while not (bench.is_homed() and bench.enable().success):
-        # An early call is refused without other effect.
-        assert bench.state != "FAULT"
-        bench.wait()
-    assert bench.state == "HOLDING"
-    assert bench.insertion.value(0x607D, 1) == -20_000
 
 
 def test_slow_drives_with_few_heartbeats_accept_limits() -> None:
