@@ -278,7 +278,6 @@ class ZaberProtocol(DriveProtocol):
             return
         del request.missing[name, message_id]
         if not request.missing:
-            del self._requests[key]
             self.on_status(request.number, {name: _state(at) for name, at in self._axes.items()})
 
     def _is_intact(self, match: re.Match[str]) -> bool:
