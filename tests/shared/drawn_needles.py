@@ -8,15 +8,6 @@ import math
 import numpy as np
 
 
-def draw_line(
-    shape: tuple[int, int], points: np.ndarray, width: float, level: float, background: float
-) -> np.ndarray:
-    """Return a float image with an anti-aliased polyline with square ends, by distance."""
-    coverage = np.zeros(shape)
-    cover_line(coverage, points, width)
-    return background + (level - background) * coverage
-
-
 def cover_line(coverage: np.ndarray, points: np.ndarray, width: float) -> None:
     """Raise the coverage of pixels, 0 to 1, to that of a polyline, only around its segments."""
     shape = coverage.shape

@@ -1,20 +1,17 @@
-"""Fixtures of tests of the tracker: the rig, and needles to draw."""
+"""Fixtures of tests of the tracker: the rig and the parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from drawn_needles import arc, draw_line
 from needle_core.files.installed import find_shared_file
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
-__all__ = ["calibration", "calibration_path", "make_arc", "make_line", "settings", "views"]
+__all__ = ["calibration", "calibration_path", "settings", "views"]
 
 
 @pytest.fixture(scope="session")
@@ -35,13 +32,3 @@ def views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCam
 @pytest.fixture
 def settings() -> StereoTrackerParameters:
     return StereoTrackerParameters()
-
-
-@pytest.fixture(scope="session")
-def make_arc() -> Callable[..., np.ndarray]:
-    return arc
-
-
-@pytest.fixture(scope="session")
-def make_line() -> Callable[..., np.ndarray]:
-    return draw_line

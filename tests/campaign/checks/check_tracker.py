@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
 
 from campaign.checking import Check, Finding, Workbench, at_most
 from campaign.tracking.calibration_study import calibrated_tip_errors
@@ -15,6 +14,7 @@ from campaign.tracking.tracker_study import (
     TrackedRun,
     run_scenario,
 )
+from needle_core.files.installed import find_shared_file
 from needle_tracker.filter.measurement import TrackState
 
 STEPS = 120
@@ -116,7 +116,7 @@ def _closed_loop(bench: Workbench, scenario: str, seeds: int, largest: float) ->
 
 
 def _calibration() -> Path:
-    return Path(get_package_share_directory("needle_tracker"), "config", "calibration.yaml")
+    return find_shared_file("needle_tracker", "config/calibration.yaml")
 
 
 def _errors(

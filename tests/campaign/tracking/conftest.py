@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from tracker_fixtures import calibration, calibration_path, make_arc, make_line, settings, views
+from tracker_fixtures import calibration, calibration_path, settings, views
 
-__all__ = ["calibration", "calibration_path", "make_arc", "make_line", "settings", "views"]
+__all__ = ["calibration", "calibration_path", "settings", "views"]

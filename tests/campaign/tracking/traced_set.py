@@ -12,12 +12,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from needle_core.commands.cli import EXIT_DONE, run_command
 from needle_core.commands.options import CommandParser
+from needle_core.files.installed import find_shared_file
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.path_traced.appearance import Appearance, draw_appearance
 from needle_sim.path_traced.insertion import trace_insertion
@@ -138,7 +138,7 @@ def _calibration(folder: Path, scene: TracedScene) -> Path:
         path.write_text(draw_box(scene.seed), encoding="utf-8")
         return path
     name = {"bench": "calibration.yaml", "top_and_side": "calibration_top_and_side.yaml"}
-    return Path(get_package_share_directory("needle_tracker"), "config", name[scene.rig])
+    return find_shared_file("needle_tracker", f"config/{name[scene.rig]}")
 
 
 def _traced(calibration: Path, scene: TracedScene) -> dict[str, NDArray[np.generic]]:

@@ -75,7 +75,7 @@ class TrackedRig:
 
         parameters = command_line_parameters(parse(["--level", "tip"]), Path("none"))
         parameters["plane_controller"] |= steering or {}
-        rig = make_rig(parameters, see=see)
+        rig = make_rig(parameters, new_sensor=see)
         operator = settings_of(SimulatedOperatorParameters, parameters, OPERATOR)
         tracked = TrackedTip(TrackedTipParameters(**settings), registration)
         self.tracker, self.target = tracker, rig[-1].settings.target_offset

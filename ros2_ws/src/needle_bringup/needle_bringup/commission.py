@@ -46,7 +46,7 @@ exit codes: 0 all stops within their bounds; 1 some are not; 2 invalid input, or
 interrupted
 """
 _STEP, _STEP_TIME, _SETTLED = 0.002, 0.41, 1.5
-_WAY = 0.01
+_DISTANCE = 0.01
 # Maximum age of joint_states, which makes a measured motion too long [s].
 _JOINTS_AGE = 2.0 * PERIOD
 # Faults that the command triggers itself, and those that the person causes.
@@ -157,13 +157,14 @@ def commission(rig: ConformanceRig, ask: Ask, *, has_pedal: bool = False) -> Ite
     _enable(rig)
     rig.runner.run(_SETTLED)
     yield Row("no_motion_by_itself", "switched on", rig.distance(begin)[0], 0.0)
-    for _ in range(round(_WAY / _STEP)):
+    for _ in range(round(_DISTANCE / _STEP)):
         _step(rig, 1.0)
         rig.until(lambda: rig.commands[-1] in rig.hand.results, "the end of a step")
-    way = (rig.positions[0] - begin[0]) * 1e3
-    answer = ask(f"The stage has moved {way:.3f} mm. Measure it, and type your value in mm.")
-    measured = abs(number("value", answer, 0.0, 1e3, "mm") - way) * 1e-3 if answer else math.nan
-    yield Row("counts_per_unit", "10 mm by hand", measured, 0.01 * _WAY)
+    moved_mm = (rig.positions[0] - begin[0]) * 1e3
+    answer = ask(f"The stage has moved {moved_mm:.3f} mm. Measure it, and type your value in mm.")
+    measured_mm = number("value", answer, 0.0, 1e3, "mm") if answer else math.nan
+    error = abs(measured_mm - moved_mm) * 1e-3
+    yield Row("counts_per_unit", "10 mm by hand", error, 0.01 * _DISTANCE)
     faults = {fault.name: fault for fault in FAULTS if can_keep(fault.rule, rig.capabilities)}
     by_hand = _BY_HAND | (_WITH_PEDAL if has_pedal else {})
     for name in (name for name in (*_OWN, *_BY_HAND) if name in faults):

@@ -65,13 +65,13 @@ def temporary_folder() -> Iterator[Path]:
 
 def processes_with(name: str, value: str) -> list[tuple[int, str]]:
     """Return (pid, command) of the processes with this environment variable."""
-    wanted = f"{name}={value}".encode()
+    variable = f"{name}={value}".encode()
     found = []
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
             continue
         try:
-            if wanted in (entry / "environ").read_bytes().split(b"\0"):
+            if variable in (entry / "environ").read_bytes().split(b"\0"):
                 command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
                 found.append((int(entry.name), command.strip()))
         except OSError:

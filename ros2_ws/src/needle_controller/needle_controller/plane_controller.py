@@ -298,8 +298,8 @@ def trajectory(command: SendStep | SendPath) -> m.Trajectory:
             points: tuple[m.TrajectoryPoint, ...] = (
                 m.TrajectoryPoint((insertion, rotation), duration),
             )
-        case SendPath(stamp_ns, places):
-            points = tuple(m.TrajectoryPoint((at, turn), time) for at, turn, time in places)
+        case SendPath(stamp_ns, corners):
+            points = tuple(m.TrajectoryPoint((at, turn), time) for at, turn, time in corners)
     return m.Trajectory(stamp_ns, (m.INSERTION_JOINT, m.ROTATION_JOINT), points)
 
 

@@ -172,7 +172,7 @@ class StereoCamera(Component):
         self._times.append(at.steady)
 
     def _report(self, at: Moment) -> Actions:
-        wanted, recent = self.settings.rate, [t for t in self._times if at.steady - t <= _WINDOW]
+        requested, recent = self.settings.rate, [t for t in self._times if at.steady - t <= _WINDOW]
         rate = (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
         values = {
             "pairs": str(self._pairs),
@@ -185,8 +185,8 @@ class StereoCamera(Component):
             level, message = Level.WARN, "waiting for subscribers"
         elif self._dropped:
             level, message = Level.WARN, "some pairs could not be read"
-        elif at.steady - self._started_at > 3.0 and rate < 0.8 * wanted:
-            level, message = Level.WARN, f"slower than the {wanted:g} Hz requested"
+        elif at.steady - self._started_at > 3.0 and rate < 0.8 * requested:
+            level, message = Level.WARN, f"slower than the {requested:g} Hz requested"
         yield Diagnose("images", Diagnostic(level, message, values))
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from drawn_needles import cover_line
 from needle_tracker.optics.refraction import RefractedCamera
-from tracker_fixtures import calibration, calibration_path, make_arc, make_line, settings, views
+from tracker_fixtures import calibration, calibration_path, settings, views
 
-__all__ = ["calibration", "calibration_path", "make_arc", "make_line", "settings", "views"]
+__all__ = ["calibration", "calibration_path", "settings", "views"]
 
 
 def _light_and_dark(view: RefractedCamera) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Sequence
 from typing import Any
 from unittest import mock
 
@@ -12,21 +11,17 @@ import pytest
 
 from needle_core.component import (
     Action,
-    Actions,
-    Component,
     Diagnose,
     Exit,
     Log,
     Moment,
     Peers,
-    Port,
     PortChange,
     Publish,
     Send,
 )
 from needle_core.diagnostics import Level
 from needle_core.errors import UserError
-from needle_core.runners.virtual import VirtualRunner
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.sources.stereo_source import EndOfRecording, PairPort, StampedPair
 from needle_tracker.stereo_camera import PAIRS, StereoCamera, StereoCameraParameters
@@ -148,31 +143,13 @@ def test_the_end_of_a_recording_reports_missing_frames(calibration: StereoCalibr
     assert [rig.gives(event) for event in events] == [[end, lacks, Exit(0)], [end, Exit(0)]]
 
 
-class Pairs(Component):
-    """Stand-in for a real source: answers each request with a pair."""
-
-    name = "source"
-
-    def __init__(self, pair: StampedPair) -> None:
-        self._pair = pair
-        self.ports = (Port(PAIRS, self._give),)
-
-    def _give(self, asked: Sequence[Any], at: Moment) -> Actions:
-        yield Send(PAIRS, tuple(self._pair for _ in asked))
-
-
-def test_pairs_come_at_the_rate_until_the_camera_is_lost(calibration: StereoCalibration) -> None:
-    rig = Rig(calibration)
-    sent: list[str] = []
-    camera = StereoCamera(StereoCameraParameters(rate=20.0), calibration)
-    runner = VirtualRunner(
-        [camera, Pairs(rig.pair())], taps=[lambda _, __, ___, output: sent.append(output.topic)]
-    )
-    runner.run(2.0)
-    assert 38 <= sent.count("stereo/left/image_raw") == sent.count("stereo/right/image_raw") <= 40
-    runner.lose_port(camera.name, PAIRS, "unplugged?")
-    assert runner.run(0.1)
-    assert runner.exits == {camera.name: Exit(2, "unplugged?")}
+def test_pairs_are_requested_at_the_rate_until_the_camera_is_lost(
+    calibration: StereoCalibration,
+) -> None:
+    camera = Rig(calibration, rate=20.0).camera
+    assert camera.timers[0].period == 1.0 / 20.0
+    (port,) = camera.ports
+    assert list(port.on_change(PortChange("unplugged?"), Moment(0.0, 0))) == [Exit(2, "unplugged?")]
 
 
 def test_a_thread_reads_the_source() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drawn_needles import arc
 from needle_core import messages as m
 from needle_core.component import Actions, Diagnose, Log, Moment, Peers, Publish
 from needle_core.diagnostics import Level
@@ -110,10 +111,10 @@ def bench(make: Make) -> Bench:
 
 
 def test_a_pair_gives_tip_and_pose_with_the_stamp_of_the_exposure(
-    bench: Bench, draw_pair: Any, make_arc: Any
+    bench: Bench, draw_pair: Any
 ) -> None:
     bench.measured = None
-    path = make_arc(0.05, 5.0, 1.0)
+    path = arc(0.05, 5.0, 1.0)
     assert bench.pair(SECOND + 20, *draw_pair(path))
     (tip,), (pose,) = bench.sent["needle/tip"], bench.sent["needle/tip_pose"]
     assert (tip.frame_id, pose.frame_id) == ("rig", "rig")

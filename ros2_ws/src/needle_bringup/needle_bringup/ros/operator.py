@@ -35,10 +35,5 @@ def main(open_device: Callable[[str], Any] = InputDevice) -> int:
         return {} if settings.source == JOY else {INPUT_DEVICE: InputPort(settings, open_device)}
 
     return run_component(
-        "operator",
-        OperatorParameters,
-        Operator,
-        help_text=HELP,
-        ports=ports,
-        shared_memory=False,
+        "operator", OperatorParameters, Operator, help_text=HELP, ports=ports, shared_memory=False
     )

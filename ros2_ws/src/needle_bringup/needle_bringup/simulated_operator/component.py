@@ -63,11 +63,7 @@ class SimulatedOperatorParameters:
         3600.0,
     )
     stall_timeout: float = fixed_parameter(
-        30.0,
-        "s",
-        "Release the hold after this time without an advance of the needle.",
-        0.1,
-        3600.0,
+        30.0, "s", "Release the hold after this time without an advance of the needle.", 0.1, 3600.0
     )
     wait_for_recorder: bool = fixed_parameter(
         False, "-", "Wait until the recorder has the parameters of all nodes."
@@ -99,10 +95,7 @@ class SimulatedOperator(Component):
         self._unrecorded: Sequence[str] = ("recorder",) if settings.wait_for_recorder else ()
         self._nodes: frozenset[str] = frozenset()
         self._sequence = OperatorSequence(
-            now,
-            self.name,
-            wait_timeout=settings.wait_timeout,
-            stall_timeout=settings.stall_timeout,
+            now, self.name, wait_timeout=settings.wait_timeout, stall_timeout=settings.stall_timeout
         )
         self._session = HoldSession(name)
         self._pending: Call | None = None

@@ -49,14 +49,7 @@ class OperatorSequence:
         Time limit for steering without progress [s].
     """
 
-    def __init__(
-        self,
-        now: float,
-        name: str,
-        *,
-        wait_timeout: float,
-        stall_timeout: float,
-    ) -> None:
+    def __init__(self, now: float, name: str, *, wait_timeout: float, stall_timeout: float) -> None:
         self._name = name
         self._wait_timeout = wait_timeout
         self._stall_timeout = stall_timeout

@@ -163,10 +163,10 @@ def _run_components(options: ConsoleOptions, parameters: Parameters, end: Shutdo
     from needle_core.runners.paced import PacedRunner  # noqa: PLC0415
 
     settings = ConsoleParameters(address=LOOPBACK, port=options.port, hold_port=options.port + 1)
-    desk = ServedPagePort(settings)
+    page = ServedPagePort(settings)
     rig, ports = _make_rig(parameters)
     components = [*rig, Console(settings)]
-    runner = PacedRunner(components, options.rig.seed, ports={PAGE: desk, **ports})
+    runner = PacedRunner(components, options.rig.seed, ports={PAGE: page, **ports})
     with contextlib.closing(runner):
         _print_address(options)
         while not end.requested:
@@ -174,7 +174,7 @@ def _run_components(options: ConsoleOptions, parameters: Parameters, end: Shutdo
                 (name, ended), *_ = runner.exits.items()
                 print(f"error: {name} ended: {ended.text}", file=sys.stderr)
                 return EXIT_MISSED
-            desk.set_lag(runner.lag)
+            page.set_lag(runner.lag)
     return EXIT_INTERRUPTED
 
 

@@ -9,11 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from needle_bags.format.bag_writer import refuse_existing_bag
-from needle_bringup.simulation.rig_configuration import (
-    PACKAGES,
-    command_line_parameters,
-    merge,
-)
+from needle_bringup.simulation.rig_configuration import PACKAGES, command_line_parameters, merge
 from needle_bringup.simulation.simulate_options import existing_file, parse
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import Parameters, read_parameters

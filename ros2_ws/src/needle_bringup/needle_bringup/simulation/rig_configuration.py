@@ -87,7 +87,7 @@ class Shared(NamedTuple):
         Default of every node.
     unit : str
         Unit.
-    places : dict of str to str
+    names : dict of str to str
         Name of the parameter in each node.
     """
 
@@ -95,7 +95,7 @@ class Shared(NamedTuple):
     option: str
     default: float | str
     unit: str
-    places: dict[str, str]
+    names: dict[str, str]
 
 
 _CURVATURES = {"sim_rig": "curvature", "plane_controller": "curvature"}
@@ -158,10 +158,7 @@ def command_line_parameters(
     }
     if options.noise_mm is not None:
         sim_rig["tip_noise"] = options.noise_mm * 1e-3
-    driver: dict[str, Any] = {
-        "link": "slcan",
-        "channel": str(can_adapter()),
-    }
+    driver: dict[str, Any] = {"link": "slcan", "channel": str(can_adapter())}
     if options.graph:
         driver["watchdog"] = driver["reply_age_limit"] = GRAPH_WATCHDOG
     information = {**run_info(options), "command": command or command_of(options)}
@@ -315,7 +312,7 @@ def contradictions(parameters: Parameters, nodes: Sequence[str]) -> list[str]:
     for shared in SHARED:
         values = {
             (node, name): parameters.get(node, {}).get(name, shared.default)
-            for node, name in shared.places.items()
+            for node, name in shared.names.items()
             if node in nodes
         }
         first = next(iter(values.values()), None)

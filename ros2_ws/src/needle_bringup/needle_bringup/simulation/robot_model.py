@@ -82,10 +82,10 @@ def _settings(parameters: Parameters) -> LiveViewParameters:
     """Return the parameters of the model, taken from any node that shares them."""
     own = LiveView.name
     values = {
-        shared.places[own]: parameters[node][name]
+        shared.names[own]: parameters[node][name]
         for shared in SHARED
-        if own in shared.places
-        for node, name in shared.places.items()
+        if own in shared.names
+        for node, name in shared.names.items()
         if name in parameters.get(node, {})
     }
     return from_values(LiveViewParameters, values, own)

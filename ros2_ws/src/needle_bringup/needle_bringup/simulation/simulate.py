@@ -32,13 +32,7 @@ from needle_bringup.simulation.rig_configuration import (
 )
 from needle_bringup.simulation.simulate_options import SimulateOptions, command_of, parse
 from needle_bringup.workplace import checkout
-from needle_core.commands.cli import (
-    EXIT_DONE,
-    EXIT_MISSED,
-    JsonValue,
-    run_command,
-    write_json,
-)
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_core.errors import UserError
 from needle_core.process.discovery import clean_environment
 from needle_core.process.ros_domain import reserve_domain_id

@@ -64,8 +64,8 @@ def make_tracker(parameters: Parameters) -> StereoTipTracker:
 
 def make_rig(
     parameters: Parameters,
-    see: Callable[[SimulatedBench, SimRigParameters], Sensor] = make_sensor,
-    track: Callable[[Parameters], Component] = make_tracker,
+    new_sensor: Callable[[SimulatedBench, SimRigParameters], Sensor] = make_sensor,
+    new_tracker: Callable[[Parameters], Component] = make_tracker,
 ) -> list[Component]:
     """Return the rig of a level.
 
@@ -73,7 +73,7 @@ def make_rig(
     ----------
     parameters : Parameters
         Parameters by node.
-    see, track : callable
+    new_sensor, new_tracker : callable
         Functions that create the sensor, and the tracker if there are images.
 
     Raises
@@ -81,12 +81,12 @@ def make_rig(
     UserError
         If a parameter is unknown or out of bounds.
     """
-    rig = SimRig(settings_of(SimRigParameters, parameters, "sim_rig"), new_sensor=see)
+    rig = SimRig(settings_of(SimRigParameters, parameters, "sim_rig"), new_sensor=new_sensor)
     level = rig.settings.level
     return [
         rig,
         *(_make_drives(parameters) if level == "drive" else []),
-        *([] if level == "tip" else [track(parameters)]),
+        *([] if level == "tip" else [new_tracker(parameters)]),
         PlaneController(settings_of(SteeringSettings, parameters, "plane_controller")),
     ]
 

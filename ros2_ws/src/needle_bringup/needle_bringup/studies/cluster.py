@@ -88,8 +88,8 @@ def on_cluster(
         except OSError as error:
             raise UserError(f"--scheduler {address}: {_line(error)}") from error
         with client:
-            wanted = [parts[number] for number in missing]
-            futures = client.map(run, wanted, pure=False, batch_size=100)
+            remaining = [parts[number] for number in missing]
+            futures = client.map(run, remaining, pure=False, batch_size=100)
             numbers = {future.key: n for future, n in zip(futures, missing, strict=True)}
             done = distributed.as_completed(futures)
             futures.clear()
@@ -128,13 +128,13 @@ def identity() -> Mapping[str, str]:
     return {"python": python, **versions, "code": code.hexdigest()[:12]}
 
 
-def _run(work: Callable[[Part], Result], wanted: Mapping[str, str], part: Part) -> Result:
+def _run(work: Callable[[Part], Result], expected: Mapping[str, str], part: Part) -> Result:
     """Run a part on a worker."""
     here = identity()
     differing = [
-        f"{name} {here[name]} instead of {wanted[name]}"
-        for name in wanted
-        if here[name] != wanted[name]
+        f"{name} {here[name]} instead of {expected[name]}"
+        for name in expected
+        if here[name] != expected[name]
     ]
     if differing:
         raise UserError(
@@ -189,10 +189,7 @@ class PartDone(NamedTuple):
 
 
 def run_parts(
-    address: str,
-    parts: Sequence[StudyPart],
-    witness: StudyPart,
-    on_progress: Callable[[int], None],
+    address: str, parts: Sequence[StudyPart], witness: StudyPart, on_progress: Callable[[int], None]
 ) -> tuple[list[Outcomes | PointOutcomes], float, list[str]]:
     """Steer the needles of all parts on the cluster of a scheduler.
 
@@ -226,8 +223,8 @@ def run_parts(
     for part, result in zip(parts, on_cluster(address, run_part, asked), strict=True):
         done.append(result)
         on_progress(len(part.starts))
-    wanted = digest(witness.run())
-    differing = sorted({part.machine for part in done if part.witness != wanted})
+    expected = digest(witness.run())
+    differing = sorted({part.machine for part in done if part.witness != expected})
     return [part.outcomes for part in done], sum(part.cpu_s for part in done), differing
 
 

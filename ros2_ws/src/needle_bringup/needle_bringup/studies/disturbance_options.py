@@ -96,7 +96,7 @@ def disturbances_of(given: argparse.Namespace) -> Disturbances:
         outlier_size=_outlier_size(given.outlier_mm),
         found=number("--found", given.found, 0.0, 1.0, "-"),
         delay=whole_number("--delay", given.delay, 0, 100),
-        untold_delay=whole_number("--untold-delay", given.untold_delay, 0, 100),
+        hidden_delay=whole_number("--untold-delay", given.untold_delay, 0, 100),
         curvature_scale=number("--kappa-scale", given.kappa_scale, 0.05, 20.0, "-"),
         curvature_patches=number("--kappa-patches", given.kappa_patches, 0.0, 0.95, "-"),
         layer=_layer(given.layer),

@@ -80,15 +80,15 @@ def monte_carlo(options: MonteCarloOptions) -> int:
             outcomes = [part.run(bar.update) for part in parts]
             worked = time.process_time() - worked_before
     results, wall = results_of(parts, outcomes), time.perf_counter() - begin
-    seen = {**results.figures, "cpu_s": worked, "wall_s": wall}
-    print(describe(seen))
+    result = {**results.figures, "cpu_s": worked, "wall_s": wall}
+    print(describe(result))
     if options.csv is not None:
         write_csv(options.csv, results.columns, options.of_a_run)
     if options.json is not None:
         names = ("controller", "estimator", "law", "planner", "grid", "seed")
         asked: dict[str, JsonValue] = {name: getattr(options, name) for name in names}
         # A study has figures either for the plane or for points.
-        write_json(options.json, {**dict.fromkeys(LABELS), **seen, **asked})
+        write_json(options.json, {**dict.fromkeys(LABELS), **result, **asked})
     return EXIT_DONE
 
 

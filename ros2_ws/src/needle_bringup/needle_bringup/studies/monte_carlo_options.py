@@ -228,12 +228,7 @@ def _parser() -> CommandParser:
             "A",
             "amplitude of each point's oscillation at 0.2 Hz in another direction [mm]",
         ),
-        (
-            "--step-mm",
-            "1",
-            "L",
-            "insertion between exposures [mm], known to the controller",
-        ),
+        ("--step-mm", "1", "L", "insertion between exposures [mm], known to the controller"),
         ("--seed", "1", "N", "seed of all random numbers; the same seed gives the same figures"),
     )
     for name, default, metavar, text in numbers:
@@ -258,11 +253,7 @@ def _parser() -> CommandParser:
         "same figures (docs/several_computers.md)",
     )
     add("--json", metavar="FILE", help="also write the figures as flat JSON")
-    add(
-        "--csv",
-        metavar="FILE",
-        help="write a line per run: its options, start and results",
-    )
+    add("--csv", metavar="FILE", help="write a line per run: its options, start and results")
     return parser
 
 

@@ -35,11 +35,7 @@ from needle_controller.presets.presets import (
     make_law,
     observer_settings,
 )
-from needle_controller.presets.steering_settings import (
-    ONE_SIDED_PRESETS,
-    PRESETS,
-    SteeringSettings,
-)
+from needle_controller.presets.steering_settings import ONE_SIDED_PRESETS, PRESETS, SteeringSettings
 from needle_controller.protocol.confidence import point_miss_probability
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
@@ -149,7 +145,7 @@ class NeedlesToPoints(SteeredNeedles):
 
     def set_targets(self, time: float, targets: FloatArray) -> None:
         """Handle the positions of the targets; see `point_study.PointController`."""
-        self._motion.see(time, targets)
+        self._motion.observe(time, targets)
 
     def insertion_left(self) -> FloatArray:
         """Return the remaining insertion of each needle; see `point_study.PointController`."""

@@ -14,7 +14,6 @@ from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.laws.roll_law import RollLawSettings
 from needle_controller.many_needles import ManyFilters
-from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.observers.estimator import Estimate
@@ -73,7 +72,7 @@ def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], Timed
         targets = np.broadcast_to(motion.last, (len(known), 3))
         rates, left = np.empty(len(known)), np.empty(len(known))
         for n, (own, law) in enumerate(laws):
-            own.see(motion.seen, targets[n])
+            own.observe(motion.last_time, targets[n])
             inserted = float(insertion[n])
             command = law(known[n], inserted / INSERTION_SPEED, inserted, float(rotation_left[n]))
             assert command.insertion_left is not None
@@ -128,12 +127,7 @@ def sliding_law(motion: TargetMotion, largest_rate: float) -> TimedLaw:
     return command
 
 
-def rrt_law(
-    motion: TargetMotion,
-    settings: SteeringSettings,
-    rng: np.random.Generator,
-    obstacles: Array | None = None,
-) -> TimedLaw:
+def rrt_law(motion: TargetMotion, settings: SteeringSettings, rng: np.random.Generator) -> TimedLaw:
     """Return the published planner as a law that plans at every step; see `rrt_replanning`.
 
     Parameters
@@ -144,10 +138,8 @@ def rrt_law(
         Settings of the needle.
     rng : numpy.random.Generator
         Random numbers of the planner.
-    obstacles : ndarray, shape (M, 7), optional
-        Ends of the axis and radius of each capsule [m]; none by default.
     """
-    around = np.zeros((0, 7)) if obstacles is None else obstacles
+    free = np.zeros((0, 7))
     cycle = DutyCycle(settings.max_rotation_per_length, settings.step_length)
 
     def command(estimate: Estimate, *_: float) -> SteeringCommand:
@@ -158,7 +150,7 @@ def rrt_law(
             np.array(estimate.position),
             np.ascontiguousarray(estimate.rotation),
             np.array(motion.last),
-            around,
+            free,
             settings.curvature,
             CLEAR,
             rng.random((SAMPLES, 4)),

@@ -46,19 +46,19 @@ class StudyPart:
         Number of the first needle.
     starts : ndarray, shape (N, 3)
         Initial x [m], pitch and roll [rad] of each needle.
-    places : ndarray, shape (N, 3)
+    points : ndarray, shape (N, 3)
         Target point of each needle [m]; (0, 3) if the target is the plane.
     """
 
     options: MonteCarloOptions
     first: int
     starts: FloatArray
-    places: FloatArray
+    points: FloatArray
 
     def of_first(self, count: int) -> StudyPart:
         """Return a part with only the first needles of this one."""
         return dataclasses.replace(
-            self, starts=self.starts[:count].copy(), places=self.places[:count].copy()
+            self, starts=self.starts[:count].copy(), points=self.points[:count].copy()
         )
 
     def run(self, on_progress: Callable[[int], None] = lambda _: None) -> Outcomes | PointOutcomes:
@@ -97,16 +97,13 @@ def settings_of(options: MonteCarloOptions) -> StudySettings:
 def parts_of(options: MonteCarloOptions) -> list[StudyPart]:
     """Return the parts of a study, in the order of its needles."""
     starts = _starts(options)
-    places: FloatArray = np.empty((0, 3))
+    points: FloatArray = np.empty((0, 3))
     if options.targets:
-        places = random_targets(starts, CURVATURE, options.seed)
+        points = random_targets(starts, CURVATURE, options.seed)
     size = needles_at_a_time(options.controller)
     return [
         StudyPart(
-            options,
-            first,
-            starts[first : first + size].copy(),
-            places[first : first + size].copy(),
+            options, first, starts[first : first + size].copy(), points[first : first + size].copy()
         )
         for first in range(0, len(starts), size)
     ]
@@ -118,7 +115,7 @@ def results_of(parts: Sequence[StudyPart], outcomes: Sequence[Outcomes | PointOu
     begun = {"x_mm": x * 1e3, "pitch_deg": np.rad2deg(pitch), "roll_deg": np.rad2deg(roll)}
     whole = concatenate(outcomes)
     if isinstance(whole, PointOutcomes):
-        ended = _of_points(whole, np.concatenate([part.places for part in parts]))
+        ended = _of_points(whole, np.concatenate([part.points for part in parts]))
     else:
         ended = _of_plane(whole)
     return Results({"runs": len(x), **ended.figures}, {**begun, **ended.columns})
@@ -163,7 +160,7 @@ def _to_points(part: StudyPart, on_progress: Callable[[int], None]) -> PointOutc
     return run_point_study(
         part.starts,
         MovingTargets(
-            part.places, options.target_drift, options.target_breath, options.seed, part.first
+            part.points, options.target_drift, options.target_breath, options.seed, part.first
         ),
         point_controller_factory(
             options.controller,
@@ -199,8 +196,8 @@ def _of_plane(outcomes: Outcomes) -> Results:
     )
 
 
-def _of_points(outcomes: PointOutcomes, places: FloatArray) -> Results:
-    x, y, z = places.T * 1e3
+def _of_points(outcomes: PointOutcomes, points: FloatArray) -> Results:
+    x, y, z = points.T * 1e3
     return Results(
         {**point_figures(outcomes), "missed_runs": int(np.sum(~outcomes.reached))},
         {

@@ -50,8 +50,8 @@ class Pose:
 
     def coordinates(self, size: int) -> tuple[Image, Image]:
         """Return coordinates along (0 at the end) and across the shaft, on the fine grid [px]."""
-        places = (np.arange(size * _FINE, dtype=np.float32) + np.float32(0.5)) / _FINE
-        x, y = np.meshgrid(places - np.float32(self.x + 0.5), places - np.float32(self.y + 0.5))
+        centres = (np.arange(size * _FINE, dtype=np.float32) + np.float32(0.5)) / _FINE
+        x, y = np.meshgrid(centres - np.float32(self.x + 0.5), centres - np.float32(self.y + 0.5))
         # Plain floats keep the grid in single precision.
         cos, sin = float(np.cos(self.heading)), float(np.sin(self.heading))
         bend, twist = float(self.bend), float(self.twist)

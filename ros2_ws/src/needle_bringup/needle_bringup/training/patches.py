@@ -16,13 +16,7 @@ from needle_bringup.training.needle_ends import (
     shifted_tracks,
     true_map,
 )
-from needle_bringup.training.samples import (
-    CANVAS,
-    WITH_BACKGROUND,
-    Sample,
-    exposed,
-    random_width,
-)
+from needle_bringup.training.samples import CANVAS, WITH_BACKGROUND, Sample, exposed, random_width
 
 Image = NDArray[np.float32]
 _THERE, _SHADOW, _TRACKS, _TORN = 0.75, 0.6, 0.4, 0.15  # probabilities
@@ -61,13 +55,13 @@ def patch(rng: np.random.Generator) -> Sample:
             before = _with(before, earlier, needle, shadow if casts else None)
     if rng.random() < 0.3:
         image, before = _alike(rng, image, before)
-    seen, background = exposed(rng, image, before if known else None)
+    photo, background = exposed(rng, image, before if known else None)
     share = np.zeros((CANVAS, CANVAS), np.uint8)
     end = np.full(2, np.nan)
     if there:
         share = np.rint(255.0 * true_map(pose, CANVAS)).astype(np.uint8)
         end = np.array([pose.x, pose.y])
-    return Sample(seen, background, share, end, width)
+    return Sample(photo, background, share, end, width)
 
 
 def _alike(rng: np.random.Generator, image: Image, before: Image) -> tuple[Image, Image]:

@@ -144,11 +144,11 @@ class CameraEffects:
             smaller = [max(round(self.shrink * side), 8) for side in size]
             values = cv2.resize(values, smaller, interpolation=cv2.INTER_AREA)
         values = values + self._noise(rng, values)
-        seen: Bytes = np.clip(np.rint(values), 0.0, 255.0).astype(np.uint8)
-        seen = self._coded(self._sharpened(self._denoised(seen)))
+        photo: Bytes = np.clip(np.rint(values), 0.0, 255.0).astype(np.uint8)
+        photo = self._coded(self._sharpened(self._denoised(photo)))
         if self.shrink < 1.0:
-            seen = np.asarray(cv2.resize(seen, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-        return seen
+            photo = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+        return photo
 
     def _noise(self, rng: np.random.Generator, values: Image) -> Image:
         noise = rng.standard_normal(values.shape, np.float32)
@@ -158,28 +158,28 @@ class CameraEffects:
         level = np.float32(self.noise) + np.float32(self.noise_share) * np.minimum(values, 255.0)
         return np.asarray(noise * level, np.float32)
 
-    def _denoised(self, seen: Bytes) -> Bytes:
+    def _denoised(self, photo: Bytes) -> Bytes:
         match self.denoise:
             case "median":
-                smooth = cv2.medianBlur(seen, 3)
+                smooth = cv2.medianBlur(photo, 3)
             case "bilateral":
-                smooth = cv2.bilateralFilter(seen, 5, 6.0 + 3.0 * self.noise, 2.0)
+                smooth = cv2.bilateralFilter(photo, 5, 6.0 + 3.0 * self.noise, 2.0)
             case _:
-                smooth = seen
+                smooth = photo
         return np.asarray(smooth, np.uint8)
 
-    def _sharpened(self, seen: Bytes) -> Bytes:
+    def _sharpened(self, photo: Bytes) -> Bytes:
         if self.sharpen == 0.0:
-            return seen
-        blurred = cv2.GaussianBlur(seen, (0, 0), self.sharpen_px)
+            return photo
+        blurred = cv2.GaussianBlur(photo, (0, 0), self.sharpen_px)
         return np.asarray(
-            cv2.addWeighted(seen, 1.0 + self.sharpen, blurred, -self.sharpen, 0.0), np.uint8
+            cv2.addWeighted(photo, 1.0 + self.sharpen, blurred, -self.sharpen, 0.0), np.uint8
         )
 
-    def _coded(self, seen: Bytes) -> Bytes:
+    def _coded(self, photo: Bytes) -> Bytes:
         if self.quality == 0:
-            return seen
-        code = cv2.imencode(".jpg", seen, [cv2.IMWRITE_JPEG_QUALITY, self.quality])[1]
+            return photo
+        code = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, self.quality])[1]
         return np.asarray(cv2.imdecode(code, cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
@@ -196,16 +196,16 @@ def exposed(
         Brightness, 0 to 255 and beyond, of the scene and its background, if any.
     """
     effects = CameraEffects.draw(rng)
-    seen = effects.apply(rng, image)
+    photo = effects.apply(rng, image)
     if before is None:
-        return seen, None
+        return photo, None
     if rng.random() < _OTHER_LIGHT:
         before = before * np.float32(rng.uniform(*_LIGHT))
     if rng.random() < _BUMPED:
         before = moved(before, rng.uniform(0.0, _BUMP_PX), rng.uniform(0.0, 2.0 * np.pi))
     if rng.random() < _OTHER_FOCUS:
         before = np.asarray(cv2.GaussianBlur(before, (0, 0), rng.uniform(*_FOCUS_PX)), np.float32)
-    return seen, effects.apply(rng, before)
+    return photo, effects.apply(rng, before)
 
 
 def moved(image: Image, distance: float, angle: float) -> Image:

@@ -61,14 +61,7 @@ def trace_scene(mitsuba: Mitsuba, rig: StereoRig, seed: int) -> TracedScene:
     depth = begin + step * (_EXPOSURES - 1)
     images, shares, ends, widths = [], [], [], []
     pairs = trace_insertion(
-        mitsuba,
-        rig,
-        look,
-        frames=_EXPOSURES,
-        depth=depth,
-        step=step,
-        begin=begin,
-        empty_first=True,
+        mitsuba, rig, look, frames=_EXPOSURES, depth=depth, step=step, begin=begin, empty_first=True
     )
     for pair in pairs:
         for side, (camera, image) in enumerate(

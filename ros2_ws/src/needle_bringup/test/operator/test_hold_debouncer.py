@@ -47,9 +47,7 @@ def counts(seen: list[tuple[InputReading, float]]) -> HoldKind:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(moments, min_size=1, max_size=30))
-def test_only_a_new_press_from_neutral_is_accepted(
-    seen: list[tuple[InputReading, float]],
-) -> None:
+def test_only_a_new_press_from_neutral_is_accepted(seen: list[tuple[InputReading, float]]) -> None:
     debouncer, now = HoldDebouncer(), 0.0
     # There is no gap before the first reading.
     seen[0] = (seen[0][0], 0.0)
@@ -89,38 +87,38 @@ class Joystick(JoySource):
     def __init__(self) -> None:
         super().__init__(JOYSTICK)
 
-    def seen(self, now: float, publishers: int = 1) -> InputReading:
+    def reading(self, now: float, publishers: int = 1) -> InputReading:
         return self.read(now, 0.5, publishers)
 
 
 def test_the_last_message_of_a_joystick_is_used_while_recent() -> None:
     source = Joystick()
-    assert isinstance(source.seen(0.0), InputLost)
+    assert isinstance(source.reading(0.0), InputLost)
     source.receive([0.0, 1.0], [1, 0, 0], 5.0)
-    assert source.seen(5.0 + 0.999 * JOY_TIMEOUT) == InputState(insert=True, speed=0.5)
-    silent = source.seen(5.0 + 1.001 * JOY_TIMEOUT)
+    assert source.reading(5.0 + 0.999 * JOY_TIMEOUT) == InputState(insert=True, speed=0.5)
+    silent = source.reading(5.0 + 1.001 * JOY_TIMEOUT)
     assert silent == InputLost("no message from the joystick for more than 0.1 s")
     source.receive([0.0, 0.5], [0, 1, 1], 6.0)
-    assert source.seen(6.0) == InputState(retract=True, speed=0.25)
+    assert source.reading(6.0) == InputState(retract=True, speed=0.25)
 
 
 def test_an_overtaken_message_is_ignored() -> None:
     source = Joystick()
     source.receive([0.0, 1.0], [1, 0, 0], 5.00, stamp=100.00)
     source.receive([0.0, 1.0], [0, 0, 0], 5.05, stamp=99.98)
-    assert source.seen(5.05) == InputState(insert=True, speed=0.5)
-    assert isinstance(source.seen(5.00 + 1.001 * JOY_TIMEOUT), InputLost)
+    assert source.reading(5.05) == InputState(insert=True, speed=0.5)
+    assert isinstance(source.reading(5.00 + 1.001 * JOY_TIMEOUT), InputLost)
     # A sender whose clock was set back counts again after a silence; without stamps, at once.
     source.receive([0.0, 1.0], [0, 0, 0], 5.11, stamp=40.00)
-    assert source.seen(5.11) == InputState(speed=0.5)
+    assert source.reading(5.11) == InputState(speed=0.5)
     source.receive([0.0, 1.0], [1, 0, 0], 5.13)
-    assert source.seen(5.13) == InputState(insert=True, speed=0.5)
+    assert source.reading(5.13) == InputState(insert=True, speed=0.5)
 
 
 def test_an_invalid_message_is_a_loss_of_the_joystick() -> None:
     for publishers, axes, buttons, why in NO_HANDS:
         source = Joystick()
         source.receive(axes, buttons, 5.0)
-        read = source.seen(5.0, publishers)
+        read = source.reading(5.0, publishers)
         assert isinstance(read, InputLost)
         assert why in read.reason

@@ -19,7 +19,7 @@ from needle_bringup.operator.hold_debouncer import (
     InputReading,
     InputState,
 )
-from needle_bringup.operator.input_device import InputDevice, KeyChanges, key_changes, set_bits
+from needle_bringup.operator.input_device import InputDevice, set_bits
 from needle_bringup.operator.input_port import OPEN_PERIOD, InputPort
 from needle_bringup.operator.parameters import OperatorParameters
 
@@ -72,7 +72,7 @@ class PlayedDevice(InputDevice):
             raise OSError(self.gone, os.strerror(self.gone))
 
 
-class Desk:
+class PedalPort:
     """Port with a simulated device and a debouncer."""
 
     def __init__(self, *down: int, **settings: Any) -> None:
@@ -97,11 +97,11 @@ class Desk:
         self.now += CYCLE
         return self.port.read(self.now)
 
-    def held(self) -> HoldKind:
+    def hold(self) -> HoldKind:
         return self.debouncer.update(self.read(), self.now).kind
 
 
-HELD, STOPPED, NOTHING = (
+HOLD, STOPPED, NOTHING = (
     InputState(insert=True, speed=0.8),
     InputState(stop=True, speed=0.8),
     InputState(speed=0.8),
@@ -109,11 +109,11 @@ HELD, STOPPED, NOTHING = (
 # Events before each reading, and the expected reading.
 LOOKS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
     # A held pedal sends nothing.
-    (((KEY, DOWN), HELD), ((), HELD), ((KEY, UP), NOTHING)),
+    (((KEY, DOWN), HOLD), ((), HOLD), ((KEY, UP), NOTHING)),
     # Key repeat is no press.
     (((KEY, REPEAT, UP), NOTHING), ((STOP, REPEAT, UP), NOTHING)),
     # A release between two readings is detected.
-    (((KEY, DOWN), HELD), ((KEY, UP, DOWN), NOTHING), ((), HELD)),
+    (((KEY, DOWN), HOLD), ((KEY, UP, DOWN), NOTHING), ((), HOLD)),
     # A short tap of the stop counts.
     (((STOP, DOWN, UP), STOPPED), ((), NOTHING)),
 )
@@ -121,80 +121,75 @@ LOOKS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
 
 def test_a_reading_ignores_key_repeat() -> None:
     for looks in LOOKS:
-        desk = Desk()
-        assert desk.read() == NOTHING
+        pedal = PedalPort()
+        assert pedal.read() == NOTHING
         for done, wanted in looks:
             if done:
-                desk.do(*done)
-            assert desk.read() == wanted
+                pedal.do(*done)
+            assert pedal.read() == wanted
 
 
 def test_a_key_down_at_the_start_must_be_pressed_again() -> None:
-    desk = Desk(KEY)
+    pedal = PedalPort(KEY)
     for _ in range(5):
-        assert desk.held() is HoldKind.NOTHING
-        desk.do(KEY, REPEAT)
-    desk.do(KEY, UP)
-    assert desk.held() is HoldKind.NOTHING
-    desk.do(KEY, DOWN)
-    assert desk.held() is HoldKind.INSERT
+        assert pedal.hold() is HoldKind.NOTHING
+        pedal.do(KEY, REPEAT)
+    pedal.do(KEY, UP)
+    assert pedal.hold() is HoldKind.NOTHING
+    pedal.do(KEY, DOWN)
+    assert pedal.hold() is HoldKind.INSERT
 
 
 def test_events_dropped_by_the_kernel_may_include_a_release() -> None:
-    desk = Desk()
-    desk.read()
-    desk.do(KEY, DOWN)
-    desk.read()
-    desk.device.sent += event(0, 3, 0)
-    assert desk.read() == NOTHING
-    assert desk.read() == HELD
+    pedal = PedalPort()
+    pedal.read()
+    pedal.do(KEY, DOWN)
+    pedal.read()
+    pedal.device.sent += event(0, 3, 0)
+    assert pedal.read() == NOTHING
+    assert pedal.read() == HOLD
 
 
 def test_an_unplugged_pedal_is_lost_and_must_be_pressed_again() -> None:
-    desk = Desk()
-    desk.held()
-    old = desk.device
-    desk.do(KEY, DOWN)
-    assert desk.held() is HoldKind.INSERT
-    old.gone, desk.is_there = errno.ENODEV, False
-    assert desk.read() == InputLost(f"/dev/input/pedal: {os.strerror(errno.ENODEV)}")
+    pedal = PedalPort()
+    pedal.hold()
+    old = pedal.device
+    pedal.do(KEY, DOWN)
+    assert pedal.hold() is HoldKind.INSERT
+    old.gone, pedal.is_there = errno.ENODEV, False
+    assert pedal.read() == InputLost(f"/dev/input/pedal: {os.strerror(errno.ENODEV)}")
     assert old.closed
-    desk.device, desk.is_there = PlayedDevice(KEY), True
+    pedal.device, pedal.is_there = PlayedDevice(KEY), True
     # The port searches for it periodically.
-    lost_until = desk.now + OPEN_PERIOD
-    while desk.now + CYCLE < lost_until:
-        assert isinstance(desk.read(), InputLost)
+    lost_until = pedal.now + OPEN_PERIOD
+    while pedal.now + CYCLE < lost_until:
+        assert isinstance(pedal.read(), InputLost)
     for _ in range(5):
-        assert desk.held() is HoldKind.NOTHING
-    assert desk.read() == HELD
-    desk.do(KEY, UP)
-    assert desk.held() is HoldKind.NOTHING
-    desk.do(KEY, DOWN)
-    assert desk.held() is HoldKind.INSERT
+        assert pedal.hold() is HoldKind.NOTHING
+    assert pedal.read() == HOLD
+    pedal.do(KEY, UP)
+    assert pedal.hold() is HoldKind.NOTHING
+    pedal.do(KEY, DOWN)
+    assert pedal.hold() is HoldKind.INSERT
 
 
 def test_a_missing_device_or_key_is_named() -> None:
-    desk = Desk()
-    desk.is_there = False
-    assert desk.read() == InputLost("/dev/input/pedal: No such file or directory")
-    desk = Desk(key=57)
-    assert desk.read() == InputLost("/dev/input/pedal: it has no key 57 (its keys: 30, 46, 48)")
-    assert desk.device.closed
+    pedal = PedalPort()
+    pedal.is_there = False
+    assert pedal.read() == InputLost("/dev/input/pedal: No such file or directory")
+    pedal = PedalPort(key=57)
+    assert pedal.read() == InputLost("/dev/input/pedal: it has no key 57 (its keys: 30, 46, 48)")
+    assert pedal.device.closed
 
 
 def test_an_axis_sets_the_speed_up_to_the_scale() -> None:
     axis = {"speed_axis": AXIS, "axis_at_zero": 0.5, "axis_at_full": -1.0}
-    desk = Desk(source="joystick", **axis)
+    pedal = PedalPort(source="joystick", **axis)
     for at, share in ((1.0, 0.0), (0.5, 0.0), (-0.25, 0.5), (-1.0, 1.0)):
-        desk.device.axis_at = at
-        read = desk.read()
+        pedal.device.axis_at = at
+        read = pedal.read()
         assert isinstance(read, InputState)
         assert read.speed == pytest.approx(0.8 * share)
-
-
-def test_key_repeat_is_no_change() -> None:
-    data = key(KEY, DOWN) + key(RETRACT, REPEAT) + key(KEY, UP) + key(STOP, DOWN)
-    assert key_changes(data) == KeyChanges(frozenset({KEY, STOP}), frozenset({KEY}))
 
 
 def test_a_file_that_is_no_input_device_is_rejected() -> None:

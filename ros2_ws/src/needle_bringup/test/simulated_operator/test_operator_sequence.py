@@ -27,27 +27,27 @@ STEERING = ControllerStatus(
 )
 
 
-def see(sequence: OperatorSequence, status: DeviceStatus, now: float = 1.0) -> None:
+def on_device(sequence: OperatorSequence, status: DeviceStatus, now: float = 1.0) -> None:
     sequence.handle_device(dataclasses.replace(status, source="/sim_rig"), now)
 
 
-def hear(sequence: OperatorSequence, now: float = 2.0, **said: Any) -> None:
+def on_controller(sequence: OperatorSequence, now: float = 2.0, **said: Any) -> None:
     sequence.handle_controller(dataclasses.replace(STEERING, **said), now)
 
 
-def unheard() -> OperatorSequence:
+def without_status() -> OperatorSequence:
     """Return a sequence that has received no status and misses no partner."""
     sequence = OperatorSequence(0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0)
     sequence.handle_missing([])
     return sequence
 
 
-def fresh() -> OperatorSequence:
+def with_device() -> OperatorSequence:
     """Return a sequence with a single simulated device."""
-    sequence = unheard()
+    sequence = without_status()
     sequence.handle_devices(["/sim_rig"])
-    see(sequence, FRESH, 0.0)
-    hear(sequence, 0.0, state="IDLE", starts=0)
+    on_device(sequence, FRESH, 0.0)
+    on_controller(sequence, 0.0, state="IDLE", starts=0)
     return sequence
 
 
@@ -67,8 +67,8 @@ def why(sequence: OperatorSequence) -> str:
 
 def reach(wanted: Call | None = None, sequence: OperatorSequence | None = None) -> OperatorSequence:
     """Return a sequence just after its first attempt of a call, at 1.0 s; None: after all calls."""
-    sequence = sequence or fresh()
-    see(sequence, DISABLED)
+    sequence = sequence or with_device()
+    on_device(sequence, DISABLED)
     for call in PREPARATION:
         assert not sequence.hold()
         assert sequence.next_call(1.0) == call
@@ -81,7 +81,7 @@ def reach(wanted: Call | None = None, sequence: OperatorSequence | None = None) 
 
 
 def test_it_calls_nothing_while_a_partner_is_missing() -> None:
-    sequence = fresh()
+    sequence = with_device()
     sequence.handle_missing(["service device/home"])
     assert sequence.next_call(1.0) is None
     sequence.check_time(29.9)
@@ -133,32 +133,32 @@ def test_an_earlier_status_does_not_end_the_homing() -> None:
     assert sequence.next_call(1.0) is None
     # A device may still report homed from last time while it searches for its switches.
     for homed in (False, True):
-        see(sequence, dataclasses.replace(MOVING, homed=homed), 2.0)
+        on_device(sequence, dataclasses.replace(MOVING, homed=homed), 2.0)
         assert sequence.next_call(2.0) is None
-    see(sequence, DISABLED, 3.0)
+    on_device(sequence, DISABLED, 3.0)
     assert sequence.next_call(3.0) == ENABLE
 
 
 def test_a_status_may_replace_the_answer_of_homing() -> None:
     overtaken, lost, stale = reach(HOME), reach(HOME), reach(HOME)
-    see(overtaken, DISABLED)
+    on_device(overtaken, DISABLED)
     overtaken.handle_answer(HOME, True, "homing", 1.0)
     assert overtaken.next_call(1.0) == ENABLE
-    see(lost, MOVING, 1.2)
+    on_device(lost, MOVING, 1.2)
     assert lost.next_call(5.0) is None, "it moves: not asked again"
-    see(lost, DISABLED, 9.0)
+    on_device(lost, DISABLED, 9.0)
     assert lost.next_call(9.0) == ENABLE
     # A homed status from before the call does not replace the answer.
-    see(stale, dataclasses.replace(DISABLED, needle_out_confirmed=True), 1.1)
+    on_device(stale, dataclasses.replace(DISABLED, needle_out_confirmed=True), 1.1)
     assert stale.next_call(1.2) is None
     assert stale.next_call(1.0 + CALL_TIMEOUT) == HOME
 
 
 def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
     sequence = reach(START)
-    hear(sequence, 1.1, starts=0, state="IDLE")
+    on_controller(sequence, 1.1, starts=0, state="IDLE")
     assert not sequence.hold()
-    hear(sequence, 1.2)
+    on_controller(sequence, 1.2)
     assert sequence.hold()
     sequence.handle_answer(START, False, "already steering", 1.3)
     assert outcome(sequence) is None
@@ -166,16 +166,16 @@ def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
 
 
 def test_start_requires_a_controller_status() -> None:
-    sequence = unheard()
+    sequence = without_status()
     sequence.handle_devices(["/sim_rig"])
-    see(sequence, DISABLED)
+    on_device(sequence, DISABLED)
     for _ in PREPARATION[:-1]:
         call = sequence.next_call(1.0)
         assert call is not None
         sequence.handle_answer(call, True, "", 1.0)
     assert sequence.next_call(1.0) is None
     assert "needle/controller_status" in sequence.pending_reason()
-    hear(sequence, 1.1, state="DONE", starts=4)
+    on_controller(sequence, 1.1, state="DONE", starts=4)
     assert sequence.next_call(1.1) == START
     sequence.handle_answer(START, True, "", 1.1)
     assert outcome(sequence) is None
@@ -184,27 +184,27 @@ def test_start_requires_a_controller_status() -> None:
 def test_the_outcome_names_the_reason() -> None:
     for state, reason in (("FAULT", "curvature lost"), ("IDLE", "stopped by hand")):
         sequence = reach()
-        hear(sequence)
-        hear(sequence, 3.0, state=state, reason=reason)
+        on_controller(sequence)
+        on_controller(sequence, 3.0, state=state, reason=reason)
         assert reason in why(sequence)
     for state in ("FAULT", "ESTOPPED"):
         sequence = reach()
-        see(sequence, dataclasses.replace(DISABLED, state=state, reason="button"))
+        on_device(sequence, dataclasses.replace(DISABLED, state=state, reason="button"))
         assert "button" in why(sequence)
-    sequence = fresh()
+    sequence = with_device()
     sequence.interrupt()
     assert why(sequence) == "interrupted"
 
 
 def test_statuses_before_the_start_are_ignored() -> None:
     for state in ("DONE", "FAULT", "IDLE"):
-        sequence = fresh()
-        hear(sequence, 0.5, state=state)
+        sequence = with_device()
+        on_controller(sequence, 0.5, state=state)
         reach(None, sequence)
-        hear(sequence, 2.0, state=state)
+        on_controller(sequence, 2.0, state=state)
         assert outcome(sequence) is None
-        hear(sequence, 2.0, starts=2)
-        hear(sequence, 3.0, state="DONE", starts=2)
+        on_controller(sequence, 2.0, starts=2)
+        on_controller(sequence, 3.0, state="DONE", starts=2)
         assert sequence.outcome is not None
         assert sequence.outcome.code == 0
 
@@ -212,14 +212,14 @@ def test_statuses_before_the_start_are_ignored() -> None:
 def test_a_start_that_ends_immediately_fails_the_run() -> None:
     """STEERING, then IDLE: a latched status of depth 1 may show only the second."""
     for state, overtakes in itertools.product(("FAULT", "IDLE"), (False, True)):
-        sequence = fresh()
-        hear(sequence, 0.5, state="IDLE")
+        sequence = with_device()
+        on_controller(sequence, 0.5, state="IDLE")
         reach(START, sequence)
         if overtakes:
-            hear(sequence, 1.0, state=state, starts=2, reason="the needle was drawn back")
+            on_controller(sequence, 1.0, state=state, starts=2, reason="the needle was drawn back")
         sequence.handle_answer(START, True, "", 1.0)
         if not overtakes:
-            hear(sequence, 1.0, state=state, starts=2, reason="the needle was drawn back")
+            on_controller(sequence, 1.0, state=state, starts=2, reason="the needle was drawn back")
         assert "the needle was drawn back" in why(sequence)
         assert sequence.outcome is not None
         assert sequence.outcome.code == 1
@@ -227,8 +227,8 @@ def test_a_start_that_ends_immediately_fails_the_run() -> None:
 
 def test_no_progress_releases_the_hold() -> None:
     sequence = reach()
-    hear(sequence, 10.0)
-    hear(sequence, 60.0)
+    on_controller(sequence, 10.0)
+    on_controller(sequence, 60.0)
     sequence.check_time(69.9)
     assert outcome(sequence) is None
     sequence.check_time(70.0)
@@ -239,14 +239,14 @@ def test_an_ignored_press_is_released_and_repeated() -> None:
     for counted_before in (False, True):
         sequence = reach()
         if counted_before:
-            see(sequence, dataclasses.replace(HOLDING, hold_owner="simulated_operator"), 1.1)
-        see(sequence, dataclasses.replace(HOLDING, press_again="simulated_operator"), 9.0)
+            on_device(sequence, dataclasses.replace(HOLDING, hold_owner="simulated_operator"), 1.1)
+        on_device(sequence, dataclasses.replace(HOLDING, press_again="simulated_operator"), 9.0)
         assert not sequence.hold()
-        see(sequence, HOLDING, 9.1)
+        on_device(sequence, HOLDING, 9.1)
         assert sequence.hold(), "the device has heard the release"
         assert sequence.presses_again == 1
         # On a busy machine statuses arrive late: a step may be under way without one.
-        see(sequence, dataclasses.replace(HOLDING, press_again="somebody"), 9.2)
+        on_device(sequence, dataclasses.replace(HOLDING, press_again="somebody"), 9.2)
         sequence.check_time(50.0)
         assert sequence.hold()
         assert sequence.presses_again == 1
@@ -262,10 +262,10 @@ def test_a_real_device_ends_the_run() -> None:
 
 
 def test_it_acts_only_on_a_single_simulated_device() -> None:
-    sequence = unheard()
+    sequence = without_status()
     sequence.handle_devices(["/device_driver"])
     assert sequence.next_call(1.0) is None, "nothing is known of it yet"
-    see(sequence, FRESH)
+    on_device(sequence, FRESH)
     assert sequence.next_call(1.0) is None, "another said that"
     sequence.handle_devices(["/sim_rig", "/device_driver"])
     assert sequence.next_call(1.0) is None

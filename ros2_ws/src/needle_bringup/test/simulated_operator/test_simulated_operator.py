@@ -34,13 +34,13 @@ class Scene:
         self.holds: list[m.HoldState] = []
         self.shown: list[ControllerStatus] = []
         self.end: Exit | None = None
-        self.see((RIG,))
+        self.discover((RIG,))
 
     @property
     def at(self) -> Moment:
         return Moment(self.now, round(self.now * 1e9))
 
-    def see(self, devices: tuple[str, ...]) -> None:
+    def discover(self, devices: tuple[str, ...]) -> None:
         topics = {"device/status": devices, "needle/controller_status": (RIG,)}
         services = frozenset(service for service, _ in STARTED)
         peers = Peers(topics, {"device/hold": devices}, services, frozenset({RIG, "stand_in"}))

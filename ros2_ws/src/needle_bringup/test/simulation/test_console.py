@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("compiled")
 Ends = Callable[["PlayedRunner"], bool]
 
 
-class PlayedDesk:
+class PlayedPage:
     """Stand-in for the page, which needs an extra to be served."""
 
     def __init__(self, settings: ConsoleParameters) -> None:
@@ -42,11 +42,11 @@ class PlayedRunner:
     last: PlayedRunner
 
     def __init__(
-        self, components: list[Component], seed: int, *, ports: dict[str, PlayedDesk]
+        self, components: list[Component], seed: int, *, ports: dict[str, PlayedPage]
     ) -> None:
         PlayedRunner.last = self
         self.names = [component.name for component in components]
-        self.desk = ports[PAGE]
+        self.page = ports[PAGE]
         self.exits: dict[str, Exit] = {}
         self.lag, self.closed = 0.25, False
 
@@ -61,7 +61,7 @@ def run(monkeypatch: pytest.MonkeyPatch, ends: Ends, port: int = 9000) -> int:
     monkeypatch.setattr(paced, "PacedRunner", PlayedRunner)
     monkeypatch.setattr(PlayedRunner, "ends", staticmethod(ends), raising=False)
     server = types.ModuleType("needle_console.page.web_server")
-    server.ServedPagePort = PlayedDesk  # type: ignore[attr-defined]
+    server.ServedPagePort = PlayedPage  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, server.__name__, server)
     with mock.patch.dict(os.environ):
         return console.main(["--level", "tip", "--port", str(port)])
@@ -71,15 +71,15 @@ def test_rig_and_page_run_until_a_signal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def ends(runner: PlayedRunner) -> bool:
-        if runner.desk.lag:
+        if runner.page.lag:
             signal.raise_signal(signal.SIGINT)
         return False
 
     assert run(monkeypatch, ends) == 130
     runner = PlayedRunner.last
     assert runner.names == ["sim_rig", "plane_controller", "console"]
-    assert (runner.desk.settings.port, runner.desk.settings.hold_port) == (9000, 9001)
-    assert runner.desk.lag == runner.lag
+    assert (runner.page.settings.port, runner.page.settings.hold_port) == (9000, 9001)
+    assert runner.page.lag == runner.lag
     assert runner.closed
     assert capsys.readouterr().out.startswith("http://127.0.0.1:9000/ ")
 

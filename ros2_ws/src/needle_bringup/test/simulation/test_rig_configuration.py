@@ -45,12 +45,12 @@ CLASSES: dict[str, type[Any]] = {
 }
 
 
-def told(words: str = "") -> Parameters:
+def nodes_for(words: str = "") -> Parameters:
     return command_line_parameters(parse(words.split()), Path("bag"))
 
 
 def test_the_command_line_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
-    found = told("--initial -3,2,15 --depth-mm 80 --play-deg 9 --lag-mm 2 --target 10,-5,100")
+    found = nodes_for("--initial -3,2,15 --depth-mm 80 --play-deg 9 --lag-mm 2 --target 10,-5,100")
     rig, controller = found["sim_rig"], found["plane_controller"]
     assert controller["target_offset"] == pytest.approx(0.003)
     assert controller["depth"] == pytest.approx(0.08)
@@ -59,7 +59,7 @@ def test_the_command_line_is_converted_to_si_and_to_an_offset_of_the_plane() -> 
     assert rig["initial_roll"] == pytest.approx(math.radians(15.0))
     assert rig["torsion_play"] == pytest.approx(math.radians(9.0))
     assert rig["torsion_lag"] == pytest.approx(0.002)
-    own = told("--target 0,0,90 --planner mine --estimator its --law theirs --seed 7")
+    own = nodes_for("--target 0,0,90 --planner mine --estimator its --law theirs --seed 7")
     for name, value in {"planner": "mine", "estimator": "its", "law": "theirs", "seed": 7}.items():
         assert own["plane_controller"][name] == value
 
@@ -67,7 +67,7 @@ def test_the_command_line_is_converted_to_si_and_to_an_offset_of_the_plane() -> 
 def test_obstacles_are_read_into_numbers(tmp_path: Path) -> None:
     path = tmp_path / "obstacles.yaml"
     path.write_text("frame: rig\nspheres: [{center: [0.0, 0.001, 0.05], radius: 0.004}]\n", "utf-8")
-    found = told(f"--target 0,0,100 --obstacles {path}")["plane_controller"]["obstacles"]
+    found = nodes_for(f"--target 0,0,100 --obstacles {path}")["plane_controller"]["obstacles"]
     assert found == [0.0, 0.001, 0.05, 0.0, 0.001, 0.05, 0.004]
 
 
@@ -77,16 +77,16 @@ def test_only_the_nodes_of_the_level_run() -> None:
     drive = camera | {"drive_emulator", "device_driver"}
     for level, nodes in (("tip", everywhere), ("camera", camera), ("drive", drive)):
         assert set(nodes_of(SimulateOptions(level=level))) == nodes
-    found = told("--level drive --graph")
+    found = nodes_for("--level drive --graph")
     assert found["device_driver"]["channel"] == found["drive_emulator"]["pty"]
     assert found["simulated_operator"]["wait_for_recorder"]
-    mixed = told("--level drive --graph --drives galil,cia402")
+    mixed = nodes_for("--level drive --graph --drives galil,cia402")
     assert mixed["drive_emulator"]["drives"] == "galil,cia402"
     port = mixed["drive_emulator"]["listen"]
     expected = {"insertion": "galil", "rotation": "cia402"}
     assert {axis: mixed["device_driver"][f"{axis}_drive"] for axis in expected} == expected
     assert mixed["device_driver"]["galil_address"] == f"127.0.0.1:{port}"
-    two = told("--level drive --graph --drives galil,zaber")
+    two = nodes_for("--level drive --graph --drives galil,zaber")
     assert two["device_driver"]["zaber_address"] == f"127.0.0.1:{port + 1}"
     # Processes that share the cores wait for each other longer.
     assert found["device_driver"]["watchdog"] > 0.1
@@ -94,12 +94,12 @@ def test_only_the_nodes_of_the_level_run() -> None:
 
 
 def test_the_controller_knows_the_sensor_of_its_level() -> None:
-    tip = told("--level tip --noise-mm 0.5")["plane_controller"]
+    tip = nodes_for("--level tip --noise-mm 0.5")["plane_controller"]
     assert (tip["tip_covariance"], tip["tip_noise"]) == ("configured", "bounded")
     assert tip["tip_noise_bound"] == pytest.approx(0.0005)
     assert tip["measurement_std"] == pytest.approx(0.0005 / math.sqrt(3.0))
-    assert told("--level tip --noise-mm 0")["plane_controller"]["tip_noise_bound"] > 0.0
-    assert "tip_noise" not in told()["plane_controller"]
+    assert nodes_for("--level tip --noise-mm 0")["plane_controller"]["tip_noise_bound"] > 0.0
+    assert "tip_noise" not in nodes_for()["plane_controller"]
 
 
 def test_the_launched_rig_is_that_of_simulate() -> None:
@@ -107,7 +107,9 @@ def test_the_launched_rig_is_that_of_simulate() -> None:
     # emulated adapter: nothing of it describes the rig.
     of_run = {"level", "seed", "preset"}
     of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
-    set_by_simulate = {node: set(values) - of_run for node, values in told("--level drive").items()}
+    set_by_simulate = {
+        node: set(values) - of_run for node, values in nodes_for("--level drive").items()
+    }
     assert set_by_simulate["sim_rig"] == of_needle
     assert set_by_simulate["plane_controller"] == {"depth", "target_offset"}
     assert set_by_simulate["stereo_tracker"] == set()
@@ -115,9 +117,7 @@ def test_the_launched_rig_is_that_of_simulate() -> None:
     assert parse([]).depth_mm == pytest.approx(SteeringSettings().depth * 1e3)
 
 
-def test_later_layers_replace_single_parameters_and_files_round_trip(
-    tmp_path: Path,
-) -> None:
+def test_later_layers_replace_single_parameters_and_files_round_trip(tmp_path: Path) -> None:
     layers: list[Parameters] = [{"sim_rig": {"level": "tip", "seed": 2}}, {"sim_rig": {"seed": 3}}]
     merged = merge(*layers, {"console": {}})
     assert merged == {"sim_rig": {"level": "tip", "seed": 3}, "console": {}}
@@ -145,7 +145,7 @@ def test_every_yaml_of_the_package_parses() -> None:
 
 def test_the_defaults_of_a_needle_are_those_of_the_nodes() -> None:
     for shared in SHARED:
-        for node, name in shared.places.items():
+        for node, name in shared.names.items():
             default = getattr(CLASSES[node](), name)
             if isinstance(shared.default, float):
                 assert default == pytest.approx(shared.default, abs=2e-4), (node, name)
@@ -156,7 +156,7 @@ def test_the_defaults_of_a_needle_are_those_of_the_nodes() -> None:
 
 
 def test_the_options_of_a_needle_set_all_nodes() -> None:
-    given = told("--curvature 5 --diameter-mm 1.2 --pre-bend-deg 6 --insertion continuous")
+    given = nodes_for("--curvature 5 --diameter-mm 1.2 --pre-bend-deg 6 --insertion continuous")
     nodes = {
         node: kind(**{k: v for k, v in given[node].items() if k in kind.__dataclass_fields__})
         for node, kind in CLASSES.items()
@@ -164,7 +164,7 @@ def test_the_options_of_a_needle_set_all_nodes() -> None:
     }
     for shared in SHARED:
         values = {
-            getattr(nodes[node], name) for node, name in shared.places.items() if node in given
+            getattr(nodes[node], name) for node, name in shared.names.items() if node in given
         }
         assert len(values) <= 1, shared
     rig, tracker = nodes["sim_rig"], nodes["stereo_tracker"]
@@ -186,10 +186,10 @@ def test_contradictions_are_reported() -> None:
         ("stereo_tracker", "needle_width", 0.001, "needle_width 0.001 m"),
         ("sim_rig", "calibration_file", "mine.yaml", "stereo_tracker has calibration_file ''"),
     ):
-        (line,) = contradictions(merge(told(), {node: {name: value}}), NODES)
+        (line,) = contradictions(merge(nodes_for(), {node: {name: value}}), NODES)
         assert said in line
-    unseen: Parameters = {node: {"curvature": 12.0} for node in ("sim_rig", "plane_controller")}
-    (line,) = contradictions(unseen, NODES)
+    curved: Parameters = {node: {"curvature": 12.0} for node in ("sim_rig", "plane_controller")}
+    (line,) = contradictions(curved, NODES)
     assert line == "sim_rig has curvature 12, but stereo_tracker expects max_curvature 9"
-    assert contradictions(unseen, ("sim_rig", "plane_controller")) == []
+    assert contradictions(curved, ("sim_rig", "plane_controller")) == []
     assert contradictions({"sim_rig": {"curvature": CURVATURE * (1 + 1e-6)}}, NODES) == []

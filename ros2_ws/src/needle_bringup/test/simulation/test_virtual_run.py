@@ -22,7 +22,7 @@ from needle_core.component import Output
 from needle_core.runners.transport import Arrival, Arrivals, Fault, Link
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_sim.sim_rig import SimRig
-from scenario.transport_faults import delay, drop, duplicate
+from scenario.transport_faults import drop
 
 pytestmark = pytest.mark.usefixtures("compiled")
 SHORT = ("--level", "tip", "--depth-mm", "6")
@@ -112,14 +112,6 @@ def test_motion_stops_when_the_hold_falls_silent() -> None:
     assert before < stopped <= before + 0.0003
     assert rig.depth == stopped
     assert any("no hold message" in outcome for outcome in rig.outcomes)
-
-
-def test_it_converges_despite_lost_late_and_duplicate_messages() -> None:
-    late = (delay(TIP, 0.2), duplicate(COMMANDS, 0.05), duplicate(TIP, 0.3))
-    faults = (drop(TIP, 0.4), drop(HOLD, 0.3), *late)
-    rig = Rig("--level", "tip", "--depth-mm", "4", faults=faults)
-    assert rig.until_end() == 0, rig.runner.exits
-    assert rig.depth == pytest.approx(0.004, abs=1e-5)
 
 
 def test_a_tip_that_leaves_the_phantom_ends_the_run() -> None:

@@ -138,10 +138,7 @@ def figures_of(folder: Path, *words: str) -> tuple[Mapping[str, object], str]:
 
 
 def test_a_cluster_gives_the_figures_of_one_machine(
-    dask: Dask,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    dask: Dask, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     figures, runs = figures_of(tmp_path)
     there = figures_of(tmp_path, "--scheduler", ADDRESS)

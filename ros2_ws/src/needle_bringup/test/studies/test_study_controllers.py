@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from needle_bringup.studies import study_controllers
@@ -24,29 +23,27 @@ from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.presets.presets import make_controller
-from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+from needle_controller.presets.steering_settings import SteeringSettings
 
 pytestmark = pytest.mark.usefixtures("compiled")
 TIPS = np.array([[0.0005, 0.0, 0.001], [-0.0005, 0.0, 0.0012]])
 
 
-class Recorder(HypothesisFilter):
-    """Filter that records its advances and the covariances of its corrections."""
+class Recorder:
+    """Estimators that record their advances and the covariances of their corrections."""
 
     def __init__(self) -> None:
         self.given: list[Any] = []
-        self.advanced: list[tuple[float, float]] = []
-        super().__init__(FilterSettings())
+        self.advanced: list[tuple[Any, Any]] = []
 
-    def advance(self, d_insertion: float, d_rotation: float) -> None:
-        self.advanced.append((d_insertion, d_rotation))
-        super().advance(d_insertion, d_rotation)
+    def start(self, tips: Array) -> None:
+        pass
 
-    def correct(
-        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
-    ) -> None:
+    def advance(self, lengths: Array, turns: Array) -> None:
+        self.advanced.append((lengths.copy(), turns))
+
+    def correct(self, tips: Array, covariance: Array | None, ages: Array) -> None:
         self.given.append(covariance)
-        super().correct(tip, covariance, age)
 
 
 def still(estimate: Any, insertion: float) -> SteeringCommand:
@@ -54,43 +51,43 @@ def still(estimate: Any, insertion: float) -> SteeringCommand:
     return SteeringCommand(0.0, 0.0)
 
 
-def test_the_controller_gets_the_claimed_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[SteeringSettings] = []
-    recorders: list[Recorder] = []
-
-    def make(settings: SteeringSettings, *_: Array, **__: int) -> tuple[Recorder, Any]:
-        made.append(settings)
-        recorders.append(Recorder())
-        return recorders[-1], still
-
-    monkeypatch.setattr(study_controllers, "make_controller", make)
-    own = {"estimator": "recorder"}
-    monkeypatch.setattr(
-        "needle_controller.presets.steering_settings.check_registered", lambda *_: None
-    )
+def test_the_controller_gets_the_claimed_noise_and_turns_after_the_delay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recorder = Recorder()
+    monkeypatch.setattr(study_controllers, "new_estimators", lambda *_: lambda _: recorder)
+    monkeypatch.setattr(study_controllers, "best_rates", lambda _: lambda *_: np.zeros(2))
     for scale in (1.0, 2.0):
-        needles = controller_factory("best", 0.002, sigma_scale=scale, turn_delay=0.0004, own=own)()
+        needles = controller_factory("best", 0.002, sigma_scale=scale, turn_delay=0.0004)()
         needles.start(TIPS)
         needles.step(0.001, np.ones(2), TIPS, 0.0)
-        assert made[-1].tip_noise_bound == 0.002
-    corrected = [recorder for recorder in recorders if recorder.given]
-    assert len(corrected) == 4
-    assert corrected[0].given == [None]
-    # uniform noise within 2 mm has a variance of (2 mm)^2 / 3; sigmas half as large
-    np.testing.assert_allclose(corrected[-1].given[0], np.eye(3) * 0.002**2 / 3.0 / 4.0)
-    # The base turns only after the turn delay.
-    np.testing.assert_allclose(corrected[0].advanced, [(0.0004, 0.0), (0.0006, 1.0)])
+    # Uniform noise within 2 mm has a variance of (2 mm)^2 / 3; sigmas half as large.
+    assert recorder.given[0] is None
+    np.testing.assert_allclose(recorder.given[1], np.eye(3) * 0.002**2 / 3.0 / 4.0)
+    np.testing.assert_allclose(
+        recorder.advanced[:2], [([0.0004] * 2, [0.0] * 2), ([0.0006] * 2, [1.0] * 2)]
+    )
 
 
-def test_python_and_compiled_loops_give_the_same_bits() -> None:
-    settings = SteeringSettings(**PAPER_NOISE)
+@pytest.mark.parametrize(
+    ("source", "sigma_scale", "covariance"),
+    [
+        ("configured", 1.0, None),
+        ("from_tip_pose", 2.0, np.eye(3) * (0.002 / math.sqrt(3.0) / 2.0) ** 2),
+    ],
+)
+def test_python_and_compiled_loops_give_the_same_bits(
+    source: str, sigma_scale: float, covariance: Array | None
+) -> None:
+    settings = SteeringSettings(tip_covariance=source, tip_noise="bounded", tip_noise_bound=0.002)
     one_by_one = SteeredNeedles(
         lambda _: SeparateEstimators(
             lambda n: make_controller(settings, np.eye(3), np.zeros(3))[0]
         ),
         each_rate(lambda _: make_controller(settings, np.eye(3))[1]),
+        covariance,
     )
-    compiled = controller_factory("best", settings.tip_noise_bound)()
+    compiled = controller_factory("best", 0.002, sigma_scale=sigma_scale)()
     rng = np.random.default_rng(2)
     rates = compiled.start(TIPS)
     np.testing.assert_array_equal(one_by_one.start(TIPS), rates)
@@ -158,7 +155,7 @@ def test_a_planned_path_is_followed_and_without_one_the_needle_stops() -> None:
     )
     needle.reset(np.zeros(3), np.zeros(2))
     for target, has_a_way in (([0.004, 0.0, 0.08], True), ([0.05, 0.0, 0.02], False)):
-        motion.see(motion.seen + 1.0 if target[0] > 0.01 else 0.0, np.array(target))
+        motion.observe(motion.last_time + 1.0 if target[0] > 0.01 else 0.0, np.array(target))
         command = planned_law(motion, settings)(needle.estimate(), 0.0, 0.0, math.inf)
         assert command.insertion_left is not None
         assert (command.insertion_left > 0.079) is has_a_way

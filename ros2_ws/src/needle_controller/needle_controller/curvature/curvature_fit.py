@@ -149,11 +149,11 @@ class CurvatureFit:
         with np.errstate(divide="ignore"):
             return np.asarray(1.0 / self.curvature)
 
-    def radius_interval(self, deviations: float = 1.96) -> tuple[Array, Array]:
-        """Return the interval of 1 / kappa [m], by default that of 95 %."""
-        least = np.maximum(self.curvature - deviations * self.std, 0.0)
+    def radius_interval(self) -> tuple[Array, Array]:
+        """Return the 95 % interval of 1 / kappa [m]."""
+        least = np.maximum(self.curvature - 1.96 * self.std, 0.0)
         with np.errstate(divide="ignore"):
-            return 1.0 / (self.curvature + deviations * self.std), 1.0 / least
+            return 1.0 / (self.curvature + 1.96 * self.std), 1.0 / least
 
 
 def fit_curvature(

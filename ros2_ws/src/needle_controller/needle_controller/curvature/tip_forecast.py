@@ -47,9 +47,9 @@ class TipForecast:
     tip: Array
     covariance: Array
 
-    def interval(self, deviations: float = 1.96) -> Array:
-        """Return the half-width of each coordinate's interval, (3,) [m], by default for 95 %."""
-        return np.asarray(deviations * np.sqrt(np.diagonal(self.covariance)))
+    def interval(self) -> Array:
+        """Return the half-width of each coordinate's 95 % interval, (3,) [m]."""
+        return np.asarray(1.96 * np.sqrt(np.diagonal(self.covariance)))
 
 
 def forecast_tip(
@@ -83,13 +83,13 @@ def forecast_tip(
         axis=-1,
     )
     residual = (tips - entry) @ axes - points[:-1]
-    seen = design[:-1]
+    observed = design[:-1]
     if not insertion_known:
         # Only the residual across the path counts.
         along = tangents[:-1]
         residual = residual - along * np.sum(residual * along, axis=-1, keepdims=True)
-        seen = seen - along[..., None] * np.einsum("ki,kij->kj", along, seen)[:, None]
-    rows = seen.reshape(-1, seen.shape[-1])
+        observed = observed - along[..., None] * np.einsum("ki,kij->kj", along, observed)[:, None]
+    rows = observed.reshape(-1, observed.shape[-1])
     weighted = rows.T * np.repeat(fit.weights / fit.measurement_std**2, 3)
     information, pull = weighted @ rows, weighted @ residual.ravel()
     precision = _prior(settings.precision(), insertion_known, design.shape[-1])
@@ -126,13 +126,13 @@ def _local_slopes(unknowns: Array, stations: Array) -> Array:
     """
     cells = np.arange(0.5 * _CELL, stations[-1], _CELL)
     points, _, _ = arc_points(unknowns[:UNKNOWNS], stations)
-    places, _, tangents = arc_points(unknowns[:UNKNOWNS], cells)
+    positions, _, tangents = arc_points(unknowns[:UNKNOWNS], cells)
     first = np.array([1.0, 0.0, 0.0]) - tangents * tangents[:, :1]
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     turned = []
     for across in (first, np.cross(tangents, first)):
         # At u, the path turns by c du about an axis perpendicular to it.
-        lever = points[:, None] - places
+        lever = points[:, None] - positions
         moved = np.cross(across, lever) * _CELL
         turned.append(np.where((stations[:, None] > cells)[..., None], moved, 0.0))
     return np.asarray(np.concatenate(turned, axis=1).transpose(0, 2, 1))

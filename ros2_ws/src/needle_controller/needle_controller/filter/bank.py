@@ -278,20 +278,20 @@ def correct_needle(
 @compiled
 def _estimated_age(needle: Any, events: Records, assumed: Any) -> float:
     """Return the hidden age of the tips of the first centimetres [m]; 0 if they are not late."""
-    inserted, ways, total = np.empty(events.size), np.empty((events.size, 3)), 0.0
+    inserted, shifts, total = np.empty(events.size), np.empty((events.size, 3)), 0.0
     for k in range(events.size):
         event = events[k]
         total += event.length
         inserted[k] = total - event.age
         for i in range(3):
-            ways[k, i] = event.tip[i] - needle.start[i] if event.is_tip else math.nan
+            shifts[k, i] = event.tip[i] - needle.start[i] if event.is_tip else math.nan
     too_deep, entry_std = 0.0, math.inf
     if needle.has_entry and needle.start_insertion <= FIRST:
         too_deep, entry_std = -needle.start_insertion, _ENTRY_STD
         for i in range(3):
             too_deep += (needle.start[i] - needle.entry[i]) * needle.initial_rotation[i, 2]
     return hidden_age(
-        inserted, ways, too_deep, entry_std, assumed.effective_bound, assumed.scale_spread
+        inserted, shifts, too_deep, entry_std, assumed.effective_bound, assumed.scale_spread
     )
 
 
@@ -321,11 +321,11 @@ def _apply_tip(
             needle.claimed[i] = reading.covariance[i, i]
         work = new_workspace()
         for n in range(needle.count):
-            seen = 1.0
+            likelihood = 1.0
             if reading.heading[3] > 0.0:
-                seen = update_by_heading(hypotheses[n], reading.heading, assumed, work)
+                likelihood = update_by_heading(hypotheses[n], reading.heading, assumed, work)
             update_hypothesis(hypotheses[n], reading, assumed, work)
-            hypotheses[n].evidence *= seen
+            hypotheses[n].evidence *= likelihood
         _reweight(needle, hypotheses, reading, assumed)
     if needle.tips % MERGE_EVERY == 0:
         merge(needle, hypotheses)

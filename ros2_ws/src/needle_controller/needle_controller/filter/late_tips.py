@@ -26,7 +26,7 @@ _OUTLIER = 4.0
 @compiled
 def hidden_age(
     inserted: Array,
-    ways: Array,
+    shifts: Array,
     too_deep: float,
     entry_std: float,
     bound: float,
@@ -41,7 +41,7 @@ def hidden_age(
     ----------
     inserted : ndarray, shape (K,)
         Insertion since the first tip at each stated exposure [m].
-    ways : ndarray, shape (K, 3)
+    shifts : ndarray, shape (K, 3)
         Displacement from the first tip to each tip [m]; NaN if there is none.
     too_deep : float
         Distance of the first tip beyond the known entry [m].
@@ -56,7 +56,7 @@ def hidden_age(
     at, missing = np.empty(inserted.size), np.empty(inserted.size)
     for k in range(inserted.size):
         # Lateral noise, in two coordinates of both tips, makes the distance longer.
-        square = ways[k, 0] ** 2 + ways[k, 1] ** 2 + ways[k, 2] ** 2 - 4.0 * least
+        square = shifts[k, 0] ** 2 + shifts[k, 1] ** 2 + shifts[k, 2] ** 2 - 4.0 * least
         if FIRST <= inserted[k] <= LAST + 1e-9 and math.isfinite(square):
             at[count] = inserted[k]
             missing[count] = inserted[k] - math.sqrt(max(square, 0.0))
@@ -98,9 +98,9 @@ def _median(values: Array, count: int) -> float:
     """Return the median of the first values."""
     rank = np.empty(count)
     for k in range(count):
-        place = k
-        while place > 0 and rank[place - 1] > values[k]:
-            rank[place] = rank[place - 1]
-            place -= 1
-        rank[place] = values[k]
+        slot = k
+        while slot > 0 and rank[slot - 1] > values[k]:
+            rank[slot] = rank[slot - 1]
+            slot -= 1
+        rank[slot] = values[k]
     return float(0.5 * (rank[(count - 1) // 2] + rank[count // 2]))

@@ -176,8 +176,8 @@ def _innovation(h: Any, reading: Reading, i: int, work: Workspace) -> tuple[floa
             c[i, k] -= by * c[b, k]
     # nu = y - u (p + dp), variance u^T P u
     x, change = h.position, work.change
-    seen = ux * (x[0] + change[0]) + uy * (x[1] + change[1]) + uz * (x[2] + change[2])
-    return y - seen, ux * c[i, 0] + uy * c[i, 1] + uz * c[i, 2]
+    predicted = ux * (x[0] + change[0]) + uy * (x[1] + change[1]) + uz * (x[2] + change[2])
+    return y - predicted, ux * c[i, 0] + uy * c[i, 1] + uz * c[i, 2]
 
 
 @compiled

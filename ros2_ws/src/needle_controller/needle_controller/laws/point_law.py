@@ -111,15 +111,15 @@ def point_turn(
         The settings.
     """
     ahead, need = _in_frame_of_tip(coordinates, target), np.empty(2)
-    way = write_need(ahead, need)
-    left = insertion_to_closest_point(ahead, way, curvature)
-    if way <= 0.0:
+    arc_length = write_need(ahead, need)
+    left = insertion_to_closest_point(ahead, arc_length, curvature)
+    if arc_length <= 0.0:
         return 0.0, left
-    # Standard deviation of x + way sin(pitch)
-    variance = uncertainty[0] + way * (2.0 * uncertainty[1] + way * uncertainty[2])
+    # Standard deviation of x + arc_length sin(pitch)
+    variance = uncertainty[0] + arc_length * (2.0 * uncertainty[1] + arc_length * uncertainty[2])
     std = math.sqrt(max(variance, 0.0))
     slack = mean_slack(torsions, settings.max_rotation_per_length)
-    wanted = desired_turn(need, way, curvature, std, slack, rotation_left, settings)
+    needed_turn = desired_turn(need, arc_length, curvature, std, slack, rotation_left, settings)
     least = settings.smallest_weight * heaviest(torsions)
     turns = weights = 0.0
     for k in range(torsions.size):
@@ -127,8 +127,8 @@ def point_turn(
         if t.weight < least or t.weight == 0.0:
             continue
         tip_turn = 0.0
-        if wanted != 0.0:
-            to_torsion = wanted + coordinates[ROLL] - t.roll
+        if needed_turn != 0.0:
+            to_torsion = needed_turn + coordinates[ROLL] - t.roll
             tip_turn = allowed_turn(to_torsion, wound, settings.max_winding)[0]
         if abs(tip_turn) < settings.scatter_dead_band * (1.0 - t.agreement):
             tip_turn = 0.0

@@ -97,7 +97,7 @@ def write_need(target: Array, need: Array) -> float:
 
 
 @compiled
-def insertion_to_closest_point(target: Array, way: float, curvature: float) -> float:
+def insertion_to_closest_point(target: Array, arc_length: float, curvature: float) -> float:
     """Return the insertion until the needle is closest to a target [m].
 
     If no arc of the needle leads there, this is the closest point of the tightest arc.
@@ -106,7 +106,7 @@ def insertion_to_closest_point(target: Array, way: float, curvature: float) -> f
     ----------
     target : ndarray, shape (3,)
         Target in the frame of the tip [m].
-    way : float
+    arc_length : float
         Length of the arc to it, see `write_need` [m].
     curvature : float
         Curvature of the needle's path [1/m].
@@ -114,7 +114,7 @@ def insertion_to_closest_point(target: Array, way: float, curvature: float) -> f
     across = math.hypot(target[0], target[1])
     square = across * across + target[2] * target[2]
     if target[2] <= 0.0 or 2.0 * across <= curvature * square:
-        return way
+        return arc_length
     return math.atan2(target[2], 1.0 / curvature - across) / curvature
 
 

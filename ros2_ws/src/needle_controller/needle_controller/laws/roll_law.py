@@ -292,17 +292,17 @@ def allowed_turn(turn: float, wound: float, max_winding: float) -> tuple[float, 
     wound, max_winding : float
         See `nearest_turn`.
     """
-    way = (turn + math.pi) % (2.0 * math.pi) - math.pi
+    candidate = (turn + math.pi) % (2.0 * math.pi) - math.pi
     best = cheapest = math.inf
     for k in range(2):
         if k == 1:
-            way -= math.copysign(2.0 * math.pi, way)
-        cost = abs(way)
-        over = abs(wound + way) - max_winding
+            candidate -= math.copysign(2.0 * math.pi, candidate)
+        cost = abs(candidate)
+        over = abs(wound + candidate) - max_winding
         if over > 0.0:
             cost += 10.0 + over
         if cost < cheapest:
-            best, cheapest = way, cost
+            best, cheapest = candidate, cost
     return best, cheapest
 
 

@@ -104,9 +104,9 @@ def least_insertion(
     # Position after levelling out immediately.
     level_x = x + np.sign(pitch) * (1.0 - np.cos(pitch)) / curvature
     # Distance to the band around the plane; below it, the needle goes up first (+x).
-    way = level_x - np.clip(level_x, -tolerance, tolerance)
-    up = np.where(way > 0.0, -1.0, 1.0)
-    distance, start = up * (x - (level_x - way)), up * pitch
+    excess = level_x - np.clip(level_x, -tolerance, tolerance)
+    up = np.where(excess > 0.0, -1.0, 1.0)
+    distance, start = up * (x - (level_x - excess)), up * pitch
     # Up to the pitch `top`, then level out: x gains (cos start - 2 cos top + 1) / kappa.
     cosine = 0.5 * (1.0 + np.cos(start) + curvature * distance)
     limit = np.maximum(LARGEST_PITCH, start)
@@ -116,7 +116,7 @@ def least_insertion(
     straight = np.maximum(short, 0.0) / np.sin(limit)
     length = (2.0 * top - start) / curvature + straight
     level = np.abs(pitch) / curvature
-    return np.asarray(np.where(np.abs(way) <= 0.0, level, length))
+    return np.asarray(np.where(np.abs(excess) <= 0.0, level, length))
 
 
 def farthest_offsets(

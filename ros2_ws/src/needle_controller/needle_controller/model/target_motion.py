@@ -69,11 +69,11 @@ class TargetMotion:
         return self._points[-1]
 
     @property
-    def seen(self) -> float:
+    def last_time(self) -> float:
         """Time of the last observation [s]."""
         return self._times[-1]
 
-    def see(self, time: float, points: npt.ArrayLike) -> None:
+    def observe(self, time: float, points: npt.ArrayLike) -> None:
         """Add an observation; a time not later than the last one discards all earlier observations.
 
         Parameters

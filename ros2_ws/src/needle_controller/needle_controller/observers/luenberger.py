@@ -140,8 +140,8 @@ class LuenbergerObserver:
         The constant gain does not use `covariance`, which only enters the estimate's covariance.
         The tip `age` ago is x - age s2 + age^2 / 2 s3.
         """
-        seen, noise = np.array(tip, dtype=float), self._settings.measurement_std**2
-        found = bool(np.all(np.isfinite(seen)))
+        measured_tip, noise = np.array(tip, dtype=float), self._settings.measurement_std**2
+        found = bool(np.all(np.isfinite(measured_tip)))
         if covariance is not None:
             known = np.array(covariance, dtype=float)
             noise = float(known[0, 0])
@@ -150,9 +150,9 @@ class LuenbergerObserver:
             return
         since = float(self._needle["since_correction"])
         of_each = sampled_observer_gain(self._model.poles, since)
-        correct_observer(self._needle, float(seen[0]), float(age), of_each, self._model)
+        correct_observer(self._needle, float(measured_tip[0]), float(age), of_each, self._model)
         gain = np.array(of_each)
-        self._tip = seen
+        self._tip = measured_tip
         if covariance is not None:
             self._tip_covariance = known
         # P <- (I - L c) P (I - L c)^T + L r L^T, c the row of F(-age) that gives x

@@ -20,17 +20,8 @@ _OFFSETS = (0.001, 0.002, 0.004, 0.007, 0.011, 0.016)
 _ENTRIES_PER_RING = 8
 
 
-def entry_state(
-    curvature: float,
-    *,
-    rotation: float = 0.0,
-    x: float = 0.0,
-    y: float = 0.0,
-    pitch: float = 0.0,
-    yaw: float = 0.0,
-    heading_std: float = 0.0,
-) -> TipState:
-    """Return a needle's tip at its entry.
+def entry_state(curvature: float, *, rotation: float = 0.0, heading_std: float = 0.0) -> TipState:
+    """Return a needle's tip at the rig's entry point.
 
     Parameters
     ----------
@@ -38,15 +29,11 @@ def entry_state(
         kappa [1/m].
     rotation : float
         Rotation of the base [rad].
-    x, y : float
-        Position of the entry, relative to the rig's entry point [m].
-    pitch, yaw : float
-        Heading [rad].
     heading_std : float
         Standard deviation of the heading [rad].
     """
-    angles = rotation_from_angles([yaw, pitch, rotation])
-    return TipState(np.array([x, y, 0.0]), angles, curvature, heading_std=heading_std)
+    turned = rotation_from_angles([0.0, 0.0, rotation])
+    return TipState(np.zeros(3), turned, curvature, heading_std=heading_std)
 
 
 def first_path(
@@ -73,12 +60,12 @@ def first_path(
     if path is not None:
         return path
     clear = planner.settings.least_clearance
-    for name, point, wanted in (
+    for name, point, minimum in (
         ("target point", target, clear - planner.settings.goal_tolerance),
         ("entry", entry.position, clear),
     ):
-        if (distance := obstacles.clearance(point)) < wanted:
-            return f"the {name} is {distance:.4g} m from an obstacle, minimum {wanted:.4g} m"
+        if (distance := obstacles.clearance(point)) < minimum:
+            return f"the {name} is {distance:.4g} m from an obstacle, minimum {minimum:.4g} m"
     possible = planner.may_have_path(entry, target, obstacles)
     path = planner.path(entry, target, obstacles, starts=THOROUGH_STARTS) if possible else None
     if path is not None:

@@ -69,22 +69,22 @@ def _fill(goal: Array, curvature: float, capsules: Array, tolerance: float) -> b
     before, here = np.zeros((size, size), np.bool_), np.zeros((size, size), np.bool_)
     before[middle, middle] = True
     box = (middle, middle, middle, middle)
-    first, place, slope = np.zeros(3), np.empty(3), goal[:2] / goal[2]
+    first, cell, slope = np.zeros(3), np.empty(3), goal[:2] / goal[2]
     for k in range(planes):
-        first[2], place[2] = depth * k / planes, depth * (k + 1) / planes
+        first[2], cell[2] = depth * k / planes, depth * (k + 1) / planes
         here[:] = False
         low_i, high_i, low_j, high_j = size, -1, size, -1
         for i in range(size):
             for j in range(size):
-                place[0] = slope[0] * place[2] + (i - middle) * _CELL
-                place[1] = slope[1] * place[2] + (j - middle) * _CELL
-                arrival = _reach_bend(_distance(_ENTRY, place), curvature)
-                ahead = _goal_bend(_distance(place, goal), curvature, tolerance)
-                if math.atan2(math.hypot(place[0], place[1]), place[2]) > arrival:
+                cell[0] = slope[0] * cell[2] + (i - middle) * _CELL
+                cell[1] = slope[1] * cell[2] + (j - middle) * _CELL
+                arrival = _reach_bend(_distance(_ENTRY, cell), curvature)
+                ahead = _goal_bend(_distance(cell, goal), curvature, tolerance)
+                if math.atan2(math.hypot(cell[0], cell[1]), cell[2]) > arrival:
                     continue
-                if _corner(_ENTRY, place, goal) > arrival + ahead:
+                if _corner(_ENTRY, cell, goal) > arrival + ahead:
                     continue
-                if _is_entered(place, goal, ahead, first, before, box, curvature, capsules):
+                if _is_entered(cell, goal, ahead, first, before, box, curvature, capsules):
                     here[i, j] = True
                     low_i, high_i = min(low_i, i), max(high_i, i)
                     low_j, high_j = min(low_j, j), max(high_j, j)
@@ -100,7 +100,7 @@ def _fill(goal: Array, curvature: float, capsules: Array, tolerance: float) -> b
 
 @compiled
 def _is_entered(
-    place: Array,
+    cell: Array,
     goal: Array,
     ahead: float,
     first: Array,
@@ -109,7 +109,7 @@ def _is_entered(
     curvature: float,
     capsules: Array,
 ) -> bool:
-    """Return whether a place can be reached from a cell of the previous plane, at first[2]."""
+    """Return whether a cell can be reached from one of the previous plane, at first[2]."""
     middle = before.shape[0] // 2
     for i in range(box[0], box[1] + 1):
         for j in range(box[2], box[3] + 1):
@@ -117,16 +117,16 @@ def _is_entered(
                 continue
             first[0] = goal[0] / goal[2] * first[2] + (i - middle) * _CELL
             first[1] = goal[1] / goal[2] * first[2] + (j - middle) * _CELL
-            step, came = _distance(first, place), _distance(_ENTRY, first)
+            step, came = _distance(first, cell), _distance(_ENTRY, first)
             turn = _bend(step + 2.0 * _UNCERTAIN, curvature) + _tilt(2.0 * _UNCERTAIN, step)
-            if _corner(_ENTRY, first, place) > _reach_bend(came, curvature) + turn:
+            if _corner(_ENTRY, first, cell) > _reach_bend(came, curvature) + turn:
                 continue
-            if _corner(first, place, goal) > turn + ahead:
+            if _corner(first, cell, goal) > turn + ahead:
                 continue
             slack = _UNCERTAIN + _sag(step + 2.0 * _UNCERTAIN, curvature)
             clear = True
             for capsule in capsules:
-                distance = segment_distance(first, place, capsule, capsule[3:])
+                distance = segment_distance(first, cell, capsule, capsule[3:])
                 if distance < capsule[6] - slack:
                     clear = False
                     break

@@ -175,8 +175,8 @@ def read_obstacles(path: Path) -> Obstacles:
         for number, row in enumerate(rows, start=1):
             name = f"{path}: {kind}, number {number}"
             if not isinstance(row, dict) or set(row) != {first, last, "radius"}:
-                wanted = ", ".join(dict.fromkeys((first, last, "radius")))
-                raise UserError(f"{name}: expected {wanted}")
+                fields = ", ".join(dict.fromkeys((first, last, "radius")))
+                raise UserError(f"{name}: expected {fields}")
             start, end = (_point(f"{name}: {key}", row[key]) for key in (first, last))
             obstacles.append(Obstacle(start, end, _number(f"{name}: radius", row["radius"])))
     try:

@@ -112,11 +112,11 @@ def optimize_legs(legs: Array, problem: PathProblem, draws: Array) -> PathEvalua
             if assessed.cost < best.cost:
                 best = assessed
                 legs[:] = candidate
-            place = k
-            while place > 0 and costs[order[place - 1]] > costs[k]:
-                order[place] = order[place - 1]
-                place -= 1
-            order[place] = k
+            rank = k
+            while rank > 0 and costs[order[rank - 1]] > costs[k]:
+                order[rank] = order[rank - 1]
+                rank -= 1
+            order[rank] = k
         sigma *= _adapt(z, d, order, sigma, rates, mean, path, matrix)
         if sigma < _LEAST_SPREAD:
             break

@@ -54,8 +54,8 @@ class OwnEstimator:
         rng: np.random.Generator,
     ) -> None:
         self._part = part
-        place = None if entry is None else np.array(entry, dtype=float)
-        self._own = part.make(settings, np.array(initial_rotation, dtype=float), place, rng)
+        entry_point = None if entry is None else np.array(entry, dtype=float)
+        self._own = part.make(settings, np.array(initial_rotation, dtype=float), entry_point, rng)
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start over at a first measurement; see `Estimator.reset`."""

@@ -71,7 +71,7 @@ class ArrivalPrediction:
         now = float(np.max(time))
         speed = self._speed(now, float(np.max(insertion)))
         self._predicted = None
-        if speed is None or not -_CLOCK_DIFFERENCE <= now - self.motion.seen <= WINDOW:
+        if speed is None or not -_CLOCK_DIFFERENCE <= now - self.motion.last_time <= WINDOW:
             return self.aim
         if self._arrival is None:
             self._arrival = time + np.maximum(left(self.aim), 0.0) / speed

@@ -88,10 +88,10 @@ class PathAhead:
         end = max(min(insertion + self._settings.horizon, self.end), knot.insertion)
         # A path never begins ahead of the needle, even if the needle moved back.
         begin = min(start.insertion, insertion)
-        places = [(begin, start.rotation), (knot.insertion, knot.rotation)]
+        corners = [(begin, start.rotation), (knot.insertion, knot.rotation)]
         if end > knot.insertion:
-            places.append((end, knot.rotation))
-        return tuple((at, rotation, (at - begin) / self._speed) for at, rotation in places)
+            corners.append((end, knot.rotation))
+        return tuple((at, rotation, (at - begin) / self._speed) for at, rotation in corners)
 
 
 class ContinuousSteering(Steering):

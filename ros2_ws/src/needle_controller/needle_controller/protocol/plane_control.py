@@ -139,7 +139,7 @@ class PlaneControl:
         """
         if self._points is None:
             self._points = PointSteering(self._settings, TargetMotion())
-        self._points.motion.see(time, point)
+        self._points.motion.observe(time, point)
 
     def configure(self, settings: SteeringSettings) -> None:
         """Change the settings, and keep the estimated pose.

@@ -200,7 +200,7 @@ class TipQueue:
         else:
             result = AcceptedTip(tip, joints)
         if isinstance(result, AcceptedTip):
-            result = self._check_place(result, settings.tip_margin) or result
+            result = self._check_position(result, settings.tip_margin) or result
         if isinstance(result, RejectedTip):
             return self._reject(result)
         if result is not None:
@@ -217,7 +217,7 @@ class TipQueue:
             queue.append(tip)
         del queue[:-_QUEUE_LENGTH]
 
-    def _check_place(self, accepted: AcceptedTip, margin: float) -> RejectedTip | None:
+    def _check_position(self, accepted: AcceptedTip, margin: float) -> RejectedTip | None:
         tip, joints = accepted.tip, accepted.joints
         rejection = check_position(tip, joints, self.last, margin)
         if rejection is None or rejection.fault is not TipFault.JUMP:

@@ -82,12 +82,6 @@ def test_slip_is_estimated_without_bias_of_the_curvature(slip: float, entry_std:
     assert 0.9 <= np.mean(np.abs(fit.slip - slip) < 1.96 * fit.slip_std) <= 0.99
 
 
-def test_plain_circle_is_a_quarter_too_curved() -> None:
-    rng = default_rng(3)
-    tips, _ = insertion_tips(200, 0.06, rng)
-    assert np.mean(circle_curvature(uniform(tips, rng))) * RADIUS == pytest.approx(1.25, abs=0.03)
-
-
 def test_outliers_do_not_count() -> None:
     rng, count = default_rng(4), 100
     exact, insertion = insertion_tips(count, 0.06, rng)

@@ -1,4 +1,4 @@
-"""Updates by a measured heading: Jacobian, batch least squares, outliers, late tips, frames."""
+"""Updates by a measured heading: Jacobian, outliers, late tips, frames."""
 
 from __future__ import annotations
 
@@ -6,30 +6,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.optimize import approx_fprime, least_squares
+from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from needle_controller.filter.filter_settings import (
-    NORMAL,
     FilterSettings,
-    NoiseHypothesis,
     RollHypothesis,
-    TorsionHypothesis,
 )
 from needle_controller.filter.heading_update import update_by_heading
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.filter.mixture import LATE
 from needle_controller.filter.records import E_TURN, ERROR, HYPOTHESIS
 from needle_controller.filter.tip_update import new_workspace
-from needle_controller.model.arc_motion import arc, rotation_exp
+from needle_controller.model.arc_motion import rotation_exp
 from needle_controller.model.arrays import Array
-from needle_controller.observers.estimator import Estimate
 
-from .needles import CURVATURE, STEP, noisy, path, turns_for
+from .needles import STEP, noisy, path, turns_for
 
 PLAIN = FilterSettings(outlier_share=1e-6, curvature_range=(0.01, 100.0))
 STD = 0.01
-NOISE = 3e-4
 
 
 def hypothesis(seed: int) -> Any:
@@ -102,77 +97,6 @@ def test_a_heading_decides_between_hypotheses() -> None:
     estimator.correct(pose[:3, 3], np.eye(3))
     weights, turned = estimator.hypotheses["weight"], estimator.hypotheses["rotation"][:, 0, 0]
     assert np.sum(weights[turned > 0.7]) < 0.01 * np.sum(weights)
-
-
-def followed(
-    settings: FilterSettings, poses: Array, tips: Array, turns: Array, *, std: float
-) -> Estimate:
-    """Return the estimate from tips and headings; without headings if `std` is 0."""
-    rng, estimator = np.random.default_rng(3), HypothesisFilter(settings)
-    estimator.reset(tips[0], np.zeros(2))
-    for turn, tip, pose in zip(turns, tips[1:], poses[1:], strict=True):
-        estimator.advance(STEP, turn)
-        if std > 0.0:
-            estimator.correct_heading(measured(pose, rng), std**2)
-        estimator.correct(tip, np.eye(3) * NOISE**2)
-    return estimator.estimate()
-
-
-def measured(pose: Array, rng: np.random.Generator) -> Array:
-    tilt = rotation_exp([*rng.normal(0.0, STD, 2), 0.0])
-    heading: Array = pose[:3, :3] @ tilt[:, 2]
-    return heading
-
-
-def test_the_estimate_is_that_of_a_batch_least_squares_fit() -> None:
-    """On an arc of 15 mm: positions, headings and the prior, without process noise."""
-    roll_std, angle_std = np.deg2rad(5.0), np.deg2rad(8.0)
-    settings = FilterSettings(
-        torsion_hypotheses=(TorsionHypothesis(0.0, 0.0, 0.0, 1.0, 0.0, 0.0),),
-        roll_hypotheses=(RollHypothesis(0.0, roll_std, 1.0),),
-        noise_hypotheses=(NoiseHypothesis(NORMAL, (1.0,), (1.0,), 1.0),),
-        tip_noise_bound=np.sqrt(3.0) * NOISE,
-        curvature_drift=0.0,
-        scale_spread=0.0,
-        scale_drift=0.0,
-        model_error=0.0,
-        outlier_share=1e-6,
-        initial_angle_std=angle_std,
-    )
-    turns = turns_for(15)
-    poses = path(turns, np.deg2rad(1.5), np.deg2rad(2.0), 1.1 * CURVATURE)
-    tips = poses[:, :3, 3] + np.random.default_rng(2).normal(0.0, NOISE, (16, 3))
-    estimate = followed(settings, poses, tips, turns, std=STD)
-    rng = np.random.default_rng(3)
-    headings = [measured(pose, rng) for pose in poses[1:]]
-    prior = np.array([angle_std, angle_std, roll_std, 0.22 * CURVATURE])
-
-    def at(values: Array) -> list[tuple[Array, Array]]:
-        motion = arc(STEP, turns, values[6])
-        place, turn = values[:3], rotation_exp(values[3:6])
-        way = []
-        for shift, step in zip(motion.shift, motion.rotation, strict=True):
-            place, turn = place + turn @ shift, turn @ step
-            way.append((place, turn))
-        return way
-
-    def residuals(values: Array) -> Array:
-        parts = [(values[:3] - tips[0]) / NOISE, (values[3:] - [0, 0, 0, CURVATURE]) / prior]
-        for (place, turn), tip, heading in zip(at(values), tips[1:], headings, strict=True):
-            parts += [(place - tip) / NOISE, (turn.T @ heading)[:2] / STD]
-        return np.concatenate(parts)
-
-    fit = least_squares(residuals, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, CURVATURE], x_scale="jac")
-    place, turn = at(fit.x)[-1]
-    std = np.sqrt(np.diag(estimate.covariance))
-    assert np.all(np.abs(estimate.position - place) < 0.1 * std[:3])
-    heading_off = estimate.rotation[:, 2] - turn[:, 2]
-    assert np.linalg.norm(heading_off) < 0.1 * std[4]
-    curvature_std = np.sqrt(np.linalg.inv(fit.jac.T @ fit.jac)[6, 6])
-    assert abs(estimate.curvature - fit.x[6]) < 0.1 * curvature_std
-    # The heading is known far better than from tips alone.
-    alone = followed(settings, poses, tips, turns, std=0.0)
-    assert std[4] < 0.4 * np.sqrt(alone.covariance[4, 4])
 
 
 def test_late_headings_are_replayed_and_the_frame_may_change() -> None:

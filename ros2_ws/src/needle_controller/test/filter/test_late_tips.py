@@ -77,39 +77,38 @@ def test_punctual_tips_and_stated_ages_are_not_detected_as_late(other: dict[str,
     assert not np.any(called_late(many_inserted_by(40, **other)))  # type: ignore[arg-type]
 
 
-def seen(late: float, slip: float = 0.0) -> tuple[Array, Array]:
-    """Return insertions and displacements of exact tips."""
+def exact_tips(late: float, slip: float = 0.0) -> tuple[Array, Array]:
+    """Return insertions and shifts of exact tips."""
     inserted = np.arange(1, 21, dtype=np.float64) * STEP
     return inserted, arc(np.maximum(inserted - late, 0.0) / (1.0 + slip))
 
 
 def test_an_age_is_not_a_slip() -> None:
-    inserted, ways = seen(0.003)
+    inserted, shifts = exact_tips(0.003)
     # Mean error of two coordinates of two tips, as claimed.
-    ways *= np.sqrt(1.0 + 4.0 * STEP**2 / 3.0 / np.sum(ways**2, axis=-1, keepdims=True).clip(1e-9))
-    assert hidden_age(inserted, ways, 0.0, *KNOWN) == pytest.approx(0.003, abs=1e-4)
-    inserted, ways = seen(0.0, 0.2)
-    assert hidden_age(inserted, ways, 0.0, *KNOWN) == 0.0
+    shifts *= np.sqrt(
+        1.0 + 4.0 * STEP**2 / 3.0 / np.sum(shifts**2, axis=-1, keepdims=True).clip(1e-9)
+    )
+    assert hidden_age(inserted, shifts, 0.0, *KNOWN) == pytest.approx(0.003, abs=1e-4)
+    inserted, shifts = exact_tips(0.0, 0.2)
+    assert hidden_age(inserted, shifts, 0.0, *KNOWN) == 0.0
+    # If the insertion scale is known to be 1, the missing insertion is an age.
+    assert hidden_age(inserted, shifts, 0.0, *KNOWN[:2], 0.0) > 0.0
 
 
 def test_a_first_tip_that_was_too_deep_is_not_an_age() -> None:
-    inserted, ways = seen(0.0)
-    ways[:, 2] -= 0.0022
-    assert hidden_age(inserted, ways, 0.0, np.inf, *KNOWN[1:]) > 0.0
-    assert hidden_age(inserted, ways, 0.0022, *KNOWN) == 0.0
+    inserted, shifts = exact_tips(0.0)
+    shifts[:, 2] -= 0.0022
+    assert hidden_age(inserted, shifts, 0.0, np.inf, *KNOWN[1:]) > 0.0
+    assert hidden_age(inserted, shifts, 0.0022, *KNOWN) == 0.0
 
 
 def test_no_age_is_detected_without_a_start_or_tips() -> None:
-    inserted, ways = seen(0.003)
-    few = np.where((inserted < FIRST + 4.5 * STEP)[:, None], ways, np.nan)
-    ages = [hidden_age(inserted, w, 0.0, *KNOWN) for w in (few, np.full_like(ways, np.nan), ways)]
+    inserted, shifts = exact_tips(0.003)
+    few = np.where((inserted < FIRST + 4.5 * STEP)[:, None], shifts, np.nan)
+    ages = [
+        hidden_age(inserted, w, 0.0, *KNOWN) for w in (few, np.full_like(shifts, np.nan), shifts)
+    ]
     np.testing.assert_array_equal(np.array(ages) > 0.0, [True, False, True])
     few[np.argmax(inserted >= FIRST)] = np.nan
     assert hidden_age(inserted, few, 0.0, *KNOWN) == 0.0
-
-
-def test_a_known_insertion_scale_leaves_no_slip() -> None:
-    inserted, ways = seen(0.0, 0.2)
-    assert hidden_age(inserted, ways, 0.0, *KNOWN) == 0.0
-    # Without slip, the missing insertion is an age.
-    assert hidden_age(inserted, ways, 0.0, *KNOWN[:2], 0.0) > 0.0

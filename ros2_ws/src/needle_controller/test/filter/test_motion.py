@@ -14,7 +14,6 @@ from needle_controller.filter.motion import (
     LARGEST_TURN,
     advance_hypothesis,
     rotate,
-    rotation_factors,
 )
 from needle_controller.filter.records import E_KAPPA, E_SCALE, E_TORSION, ERROR, HYPOTHESIS
 from needle_controller.model.arrays import Array
@@ -48,16 +47,6 @@ def moved(h: Any, length: float, turn: float, settings: FilterSettings = NO_DRIF
     after = h.copy()
     advance_hypothesis(after, 0.0, turn, length, settings.assumptions(), np.zeros((6, 6)))
     return after
-
-
-@pytest.mark.parametrize("angle", [1e-3, 0.5, 1.0, 2.0])
-def test_rodrigues_factors(angle: float) -> None:
-    wanted = [
-        np.sin(angle) / angle,
-        (1.0 - np.cos(angle)) / angle**2,
-        (angle - np.sin(angle)) / angle**3,
-    ]
-    assert rotation_factors(angle**2) == pytest.approx(wanted, rel=1e-6 if angle < 0.01 else 5e-8)
 
 
 @pytest.mark.parametrize(("length", "turn"), CASES)
@@ -112,18 +101,6 @@ def test_the_covariance_follows_the_steps_derivative(
     scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
     np.testing.assert_allclose(found / scale, wanted / scale, atol=2e-3)
     np.testing.assert_array_equal(found, found.T)
-
-
-def test_torsion_angles_are_updated() -> None:
-    for play, lag in TORSIONS:
-        before = hypothesis(play, lag)
-        after = moved(before, 0.001, 0.5)
-        assert after["behind_play"] == pytest.approx(0.5 * before["gain"] - play)
-        if lag:
-            assert 0.0 < after["tip_angle"] < after["behind_play"]
-        else:
-            assert after["tip_angle"] == after["behind_play"]
-            assert after["dtip_dtorsion"] == (-1.0 if play else 0.5)
 
 
 @pytest.mark.parametrize(("play", "lag"), [(0.1, 0.0), (0.0, 0.004), (0.0, 0.0)])

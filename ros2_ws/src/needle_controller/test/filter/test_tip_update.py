@@ -91,13 +91,6 @@ def test_truncated_moments_equal_scipys(lower: float, upper: float) -> None:
     np.testing.assert_allclose(other, [mass, -mean, variance], rtol=1e-9, atol=1e-12)
 
 
-def test_a_missing_tip_is_none() -> None:
-    for tip, spread in (([np.nan, 0.0, 0.0], 1.0), ([0.0, 0.0, 0.0], np.inf)):
-        reading = new_reading()
-        reading.tip[:], reading.covariance[:] = tip, np.full((3, 3), spread)
-        assert not prepare_reading(reading)
-
-
 def test_uniform_noise_gives_the_posteriors_moments() -> None:
     """Against samples of the prior inside the box; one coordinate is measured."""
     rng = np.random.default_rng(4)

@@ -24,7 +24,7 @@ Path = Callable[[float], Array]
 def seen(path: Path, end: float, every: float = 0.25, begin: float = 0.0) -> TargetMotion:
     motion = TargetMotion()
     for time in np.arange(0.0, end + 1e-9, every):
-        motion.see(begin + float(time), path(float(time)))
+        motion.observe(begin + float(time), path(float(time)))
     return motion
 
 
@@ -96,7 +96,7 @@ def test_a_target_at_rest_or_hardly_observed_is_predicted_exactly_at_its_last_po
 def test_the_prediction_restarts_when_time_goes_back() -> None:
     motion = seen(sine(0.2), 25.0)
     for time in np.arange(3.0, 13.0, 0.25):
-        motion.see(float(time), drift(float(time)))
+        motion.observe(float(time), drift(float(time)))
     np.testing.assert_allclose(motion.at(15.0), drift(15.0), atol=1e-4)
 
 
@@ -154,7 +154,7 @@ def test_no_target_is_predicted_far_from_its_observed_positions() -> None:
         motion, points = TargetMotion(), []
         for time in times:
             points.append(PLACE + rng.normal(0.0, 1e-3, 3))
-            motion.see(float(time), points[-1])
+            motion.observe(float(time), points[-1])
         extent = np.ptp(points, axis=0)
         ahead = np.array([motion.at(float(times[-1]) + t) for t in (0.5, 3.0, 30.0)])
         assert np.all(ahead <= np.max(points, axis=0) + 2.0 * extent + 1e-12)

@@ -25,7 +25,7 @@ def device(state: str, homed: bool = True, owner: str = "", reason: str = "") ->
     return DeviceStatus(state=state, homed=homed, hold_owner=owner, reason=reason)
 
 
-HELD = device("HOLDING", owner="operator")
+HOLD = device("HOLDING", owner="operator")
 MOVING = device("MOVING", owner="operator")
 FREE = device("HOLDING")
 
@@ -43,7 +43,7 @@ class Rig:
         preset: str = "best",
         insertion: float = 0.0,
         rotation: float = 0.0,
-        way: str = "stepwise",
+        insertion_mode: str = "stepwise",
     ) -> None:
         self.steering = make_steering(
             SteeringSettings(
@@ -51,13 +51,13 @@ class Rig:
                 depth=depth,
                 target_offset=0.003,
                 tip_covariance=tip_covariance,
-                insertion=way,
+                insertion=insertion_mode,
             )
         )
         self.now = TICK
         self.insertion = insertion
         self.rotation = rotation
-        self.steering.on_device(HELD if held else FREE)
+        self.steering.on_device(HOLD if held else FREE)
         self.joints()
         if started:
             assert self.start() == "steering"
@@ -110,7 +110,7 @@ class Rig:
             actions = self.expose()
             if not none_sent(actions):
                 return sent(actions)
-        raise AssertionError(f"{most} good tips, no step: {where(self)} {self.steering.reason}")
+        raise AssertionError(f"{most} good tips, no step: {state_of(self)} {self.steering.reason}")
 
 
 def sent(actions: list[Action]) -> SendStep:
@@ -127,7 +127,7 @@ def logged(actions: list[Action]) -> str:
     return "; ".join(action.text for action in actions if isinstance(action, Log))
 
 
-def where(rig: Rig) -> tuple[SteeringState, Awaiting]:
+def state_of(rig: Rig) -> tuple[SteeringState, Awaiting]:
     return rig.steering.state, rig.steering.awaiting
 
 

@@ -19,7 +19,7 @@ from needle_controller.protocol.confidence import Confidence
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.motion_monitors import MAX_ABORTS_AT_REST
 
-from .rig import FREE, HELD, MOVING, TICK, Rig, logged, sent, spied, where
+from .rig import FREE, HOLD, MOVING, TICK, Rig, logged, sent, spied, state_of
 
 MM = 1e-3
 AT_WORK = (SteeringState.STEERING, Awaiting.TIP)
@@ -44,7 +44,7 @@ class ContinuousRig(Rig):
     path: SendPath | None = None
 
     def __init__(self, *, depth: float = 0.12) -> None:
-        super().__init__(depth=depth, way="continuous")
+        super().__init__(depth=depth, insertion_mode="continuous")
 
     def go_to(self, insertion: float) -> None:
         """Advance along the path, at most to its end."""
@@ -56,9 +56,9 @@ class ContinuousRig(Rig):
     def go(self, distance: float) -> list[Action]:
         """Advance, then expose the tip; return the actions."""
         self.go_to(self.insertion + distance)
-        return self.see()
+        return self.expose_tip()
 
-    def see(self, x: float = 0.0) -> list[Action]:
+    def expose_tip(self, x: float = 0.0) -> list[Action]:
         actions = self.expose(x=x)
         self.path = [self.path, *paths_in(actions)][-1]
         return actions
@@ -69,31 +69,31 @@ class ContinuousRig(Rig):
         while self.steering.state is SteeringState.STEERING:
             count += 1
             yield count
-            self.steering.on_result(path_in(self.see()).stamp_ns, "aborted: no")
+            self.steering.on_result(path_in(self.expose_tip()).stamp_ns, "aborted: no")
 
 
 def test_a_tip_leads_to_the_rotation_of_a_step_and_a_path_beyond(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stepwise, rig = Rig(), ContinuousRig()
-    step, path = sent(stepwise.expose()), path_in(rig.see())
+    step, path = sent(stepwise.expose()), path_in(rig.expose_tip())
     (start, knot, end) = path.points
     assert start == (0.0, 0.0, 0.0)
     assert knot == pytest.approx((step.insertion, step.rotation, step.duration))
     assert end == pytest.approx((2 * MM, step.rotation, 2 * step.duration))
     assert path.stamp_ns == rig.steering.command_ns == rig.now
-    assert where(rig) == AT_WORK
+    assert state_of(rig) == AT_WORK
     # An uncertain estimate halves the speed.
     doubtful = ContinuousRig()
     monkeypatch.setattr(
         steering, "assess_confidence", lambda *_: Confidence("doubtful", is_doubtful=True)
     )
-    assert path_in(doubtful.see()).points[1][2] == pytest.approx(2.0 * step.duration)
+    assert path_in(doubtful.expose_tip()).points[1][2] == pytest.approx(2.0 * step.duration)
 
 
 def test_a_tip_within_a_step_length_only_renews_the_path() -> None:
     rig = ContinuousRig()
-    first = path_in(rig.see())
+    first = path_in(rig.expose_tip())
     actions = rig.go(0.4 * MM)
     again = path_in(actions)
     assert updates_in(actions) == 0
@@ -102,15 +102,15 @@ def test_a_tip_within_a_step_length_only_renews_the_path() -> None:
     assert again.points[2][:2] == pytest.approx((2.4 * MM, first.points[2][1]))
     assert updates_in(rig.go(0.598 * MM)) == rig.steering.step == 0
     # At rest no tip is used twice.
-    assert updates_in(rig.see()) == updates_in(rig.see()) == 0
+    assert updates_in(rig.expose_tip()) == updates_in(rig.expose_tip()) == 0
     assert updates_in(rig.go(0.0015 * MM)) == rig.steering.step == 1
 
 
 def test_the_path_begins_at_a_needle_that_went_back() -> None:
     rig = ContinuousRig()
-    first = path_in(rig.see())
+    first = path_in(rig.expose_tip())
     rig.insertion = -0.2 * MM
-    again = path_in(rig.see())
+    again = path_in(rig.expose_tip())
     assert again.points[0] == (-0.2 * MM, 0.0, 0.0)
     assert again.points[1][:2] == first.points[1][:2]
     assert again.points[2] == pytest.approx((1.8 * MM, first.points[1][1], 1.0))
@@ -119,11 +119,11 @@ def test_the_path_begins_at_a_needle_that_went_back() -> None:
 
 def test_the_path_ends_at_the_depth_and_steering_there() -> None:
     rig = ContinuousRig(depth=2.5 * MM)
-    rig.see()
+    rig.expose_tip()
     while rig.insertion < 2.5 * MM - 1.1e-5:
         assert rig.steering.state is SteeringState.STEERING
         rig.go_to(min(rig.insertion + 0.3 * MM, 2.5 * MM - 0.9e-5))
-        rig.see()
+        rig.expose_tip()
         assert rig.path is not None
         assert rig.path.points[-1][0] <= 2.5 * MM
     # An axis rests beside its goal: the last tip is used there, and the path leads to the end.
@@ -137,21 +137,21 @@ def test_the_path_ends_at_the_depth_and_steering_there() -> None:
 def test_the_path_ends_at_the_point_before_the_depth() -> None:
     rig = ContinuousRig()
     rig.steering.control.target_point = np.array([0.0, 0.0, 0.0015])
-    assert path_in(rig.see()).points[-1][0] == pytest.approx(1.5 * MM, rel=0.01)
+    assert path_in(rig.expose_tip()).points[-1][0] == pytest.approx(1.5 * MM, rel=0.01)
 
 
 def test_without_hold_no_path_and_after_it_only_from_a_new_tip() -> None:
     rig = ContinuousRig()
-    rig.see()
+    rig.expose_tip()
     rig.steering.on_device(MOVING)
     rig.go(0.4 * MM)
     said = rig.steering.on_result(rig.steering.command_ns, "aborted: hold released")
     assert logged(said) == "path aborted: hold released"
     rig.steering.on_device(FREE)
-    assert where(rig) == (SteeringState.STEERING, Awaiting.HOLD)
-    assert not paths_in(rig.see())
-    assert rig.steering.on_device(HELD) == []
-    assert path_in(rig.see()).stamp_ns == rig.now
+    assert state_of(rig) == (SteeringState.STEERING, Awaiting.HOLD)
+    assert not paths_in(rig.expose_tip())
+    assert rig.steering.on_device(HOLD) == []
+    assert path_in(rig.expose_tip()).stamp_ns == rig.now
 
 
 def test_an_accepted_path_resets_the_count_of_aborts() -> None:
@@ -160,10 +160,10 @@ def test_an_accepted_path_resets_the_count_of_aborts() -> None:
         for count in rig.refused():
             if count == MAX_ABORTS_AT_REST:
                 break
-        first = path_in(rig.see())
-        rig.see()
+        first = path_in(rig.expose_tip())
+        rig.expose_tip()
         assert rig.steering.on_result(first.stamp_ns, text) == []
-        assert where(rig) == AT_WORK
+        assert state_of(rig) == AT_WORK
     # Answers to paths that were never sent are ignored.
     for stamp in (rig.steering.command_ns + 1, rig.steering.command_ns + TICK):
         assert rig.steering.on_result(stamp, "aborted: no") == []
@@ -173,14 +173,14 @@ def test_an_accepted_path_resets_the_count_of_aborts() -> None:
 def test_aborts_in_a_row_are_a_fault() -> None:
     for late in (0, 1, 3):
         rig = ContinuousRig()
-        stamps = [path_in(rig.see()).stamp_ns for _ in range(late)]
-        heard = 0
+        stamps = [path_in(rig.expose_tip()).stamp_ns for _ in range(late)]
+        answered = 0
         while rig.steering.state is SteeringState.STEERING:
-            heard += 1
-            stamps.append(path_in(rig.see()).stamp_ns)
+            answered += 1
+            stamps.append(path_in(rig.expose_tip()).stamp_ns)
             rig.steering.on_result(stamps[-1 - late], "aborted: no")
-            assert heard < 100
-        assert heard == 1 + (MAX_ABORTS_AT_REST - 1) * (late + 1)
+            assert answered < 100
+        assert answered == 1 + (MAX_ABORTS_AT_REST - 1) * (late + 1)
         assert rig.steering.state is SteeringState.FAULT
         assert "without motion" in rig.steering.reason
 
@@ -189,12 +189,12 @@ def test_paths_are_sent_again_after_the_clock_went_back() -> None:
     rig = ContinuousRig()
     rig.now = 500 * TICK
     rig.settle()
-    rig.steering.on_result(path_in(rig.see()).stamp_ns, "aborted: no")
+    rig.steering.on_result(path_in(rig.expose_tip()).stamp_ns, "aborted: no")
     rig.now = TICK
     rig.settle()
     assert rig.steering.state is SteeringState.IDLE
     assert rig.start() == "steering"
-    actions = rig.see()
+    actions = rig.expose_tip()
     # A needle that is out restarts the estimate, with a new path.
     assert updates_in(actions) == 1
     assert "aborted" in logged(rig.steering.on_result(path_in(actions).stamp_ns, "aborted: no"))
@@ -202,27 +202,27 @@ def test_paths_are_sent_again_after_the_clock_went_back() -> None:
 
 def test_the_tip_timeout_ends_with_a_good_tip() -> None:
     rig = ContinuousRig()
-    rig.see()
+    rig.expose_tip()
     for second in range(10):
         # Tips that renew the path reset the timeout.
         assert rig.steering.on_time(float(second)) == []
-        rig.see()
+        rig.expose_tip()
     rig.steering.on_time(10.0)
     rig.steering.on_time(12.1)
-    assert where(rig)[0] is SteeringState.WAITING_FOR_TIP
+    assert state_of(rig)[0] is SteeringState.WAITING_FOR_TIP
     assert "received a good tip" in logged(rig.go(0.2 * MM))
-    assert where(rig)[0] is SteeringState.STEERING
+    assert state_of(rig)[0] is SteeringState.STEERING
     assert rig.steering.reason == ""
 
 
 def test_the_estimator_follows_intermediate_joint_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = ContinuousRig()
-    rig.see()
-    way = spied(rig, monkeypatch.setattr, "advance")
+    rig.expose_tip()
+    advances = spied(rig, monkeypatch.setattr, "advance")
     for mm, rad in ((0.25, 0.0), (0.3, 0.05), (0.5, 0.1), (0.75, 0.2), (1.0, 0.4)):
         rig.insertion, rig.rotation = mm * MM, rad
         rig.settle(1)
-    rig.see()
-    assert np.array(way) == pytest.approx(
+    rig.expose_tip()
+    assert np.array(advances) == pytest.approx(
         np.array([[0.25e-3, 0.0], [0.25e-3, 0.1], [0.25e-3, 0.1], [0.25e-3, 0.2]])
     )

@@ -7,7 +7,7 @@ import pytest
 from needle_controller.protocol.actions import Awaiting, SteeringState
 from needle_controller.protocol.motion_monitors import MAX_ABORTS_AT_REST, MAX_UNFOLLOWED_STEPS
 
-from .rig import FREE, HELD, MOVING, TICK, Rig, device, logged, none_sent, sent, where
+from .rig import FREE, HOLD, MOVING, TICK, Rig, device, logged, none_sent, sent, state_of
 
 IDLE, FAULT = SteeringState.IDLE, SteeringState.FAULT
 NOTHING = Awaiting.NOTHING
@@ -22,12 +22,12 @@ def test_a_lost_answer_is_a_fault_without_motion() -> None:
     for second in range(100):
         rig.settle(1)
         assert rig.steering.on_time(float(second)) == []
-    rig.steering.on_device(HELD)
+    rig.steering.on_device(HOLD)
     assert rig.steering.on_time(99.0 + 0.99 * timeout) == []
     actions = rig.steering.on_time(99.0 + timeout)
     assert none_sent(actions)
     assert "no device/result for step 1 in 10 s" in logged(actions)
-    assert where(rig) == (FAULT, NOTHING)
+    assert state_of(rig) == (FAULT, NOTHING)
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
     assert rig.expose() == []
@@ -58,12 +58,12 @@ def test_silence_of_the_device_and_its_end_are_logged() -> None:
         assert rig.steering.on_time(9.9) == []
         assert "no message from the device for 10 s" in logged(rig.steering.on_time(10.0))
         assert rig.steering.watchdog.silence
-        assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
+        assert state_of(rig) == (SteeringState.STEERING, Awaiting.RESULT)
         assert rig.steering.on_time(1e3) == []
         heard = rig.settle(1) if by_joints else rig.steering.on_device(MOVING)
         assert "sends messages again" in logged(heard)
         assert not rig.steering.watchdog.silence
-        rig.steering.on_device(HELD)
+        rig.steering.on_device(HOLD)
         rig.run(step)
         rig.steering.on_time(2e3)
     # The silence is cleared at the end of a run.
@@ -83,7 +83,7 @@ def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
     assert rig.settle() == []
     rig.insertion -= 0.00002
     assert "IDLE: needle retracted to 0.00479 m" in logged(rig.settle())
-    assert where(rig) == (IDLE, NOTHING)
+    assert state_of(rig) == (IDLE, NOTHING)
     assert not rig.steering.control.started
     assert rig.steering.tips.last is None
     rig.insertion = 0.004
@@ -108,14 +108,14 @@ def test_a_device_that_stops_ends_steering() -> None:
         rig = Rig()
         step = sent(rig.expose())
         (log,) = rig.steering.on_device(status)
-        assert where(rig) == (state, NOTHING)
+        assert state_of(rig) == (state, NOTHING)
         assert getattr(log, "severity", "") == severity
         said = logged([log])
         assert f"{state.value}: device is {status.state}" in said
         assert status.reason in said
         assert rig.steering.on_result(step.stamp_ns, "aborted: stopped") == []
         assert rig.expose() == []
-        rig.steering.on_device(HELD)
+        rig.steering.on_device(HOLD)
         assert rig.start() == "steering"
 
 
@@ -127,7 +127,7 @@ def test_commands_without_motion_are_a_fault_and_a_start_resets_the_count() -> N
             assert rig.steering.state is SteeringState.STEERING
             step = sent(rig.expose())
             actions = rig.steering.on_result(step.stamp_ns, "aborted: beyond a limit")
-        assert where(rig) == (FAULT, NOTHING)
+        assert state_of(rig) == (FAULT, NOTHING)
         assert "10 commands in a row ended without motion" in logged(actions)
         assert "beyond a limit" in logged(actions)
         assert rig.start() == "steering"
@@ -145,8 +145,8 @@ def test_repeated_releases_are_not_a_fault() -> None:
         step = sent(rig.expose())
         rig.steering.on_result(step.stamp_ns, "aborted: hold released")
         rig.steering.on_device(FREE)
-        rig.steering.on_device(HELD)
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
+        rig.steering.on_device(HOLD)
+    assert state_of(rig) == (SteeringState.STEERING, Awaiting.TIP)
 
 
 def test_unfollowed_steps_are_a_fault() -> None:
@@ -159,7 +159,7 @@ def test_unfollowed_steps_are_a_fault() -> None:
             said = logged(rig.settle())
             assert "device/result reports success" in said
             assert ("3 times in a row" in said) is (count == MAX_UNFOLLOWED_STEPS)
-        assert where(rig) == (FAULT, NOTHING)
+        assert state_of(rig) == (FAULT, NOTHING)
         assert rig.steering.step == 3
         # A start resets the count.
         assert rig.start() == "steering"

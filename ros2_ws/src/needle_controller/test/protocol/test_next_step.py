@@ -14,10 +14,7 @@ from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import next_step
-from needle_controller.protocol.confidence import (
-    assess_confidence,
-    point_miss_probability,
-)
+from needle_controller.protocol.confidence import assess_confidence, point_miss_probability
 from needle_controller.protocol.joint_history import JointSample
 
 SETTINGS = SteeringSettings(depth=0.12)

@@ -20,14 +20,14 @@ from needle_controller.protocol.confidence import Confidence
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_checks import TipMeasurement
 
-from .rig import FREE, HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
+from .rig import FREE, HOLD, MOVING, TICK, Rig, logged, none_sent, sent, state_of
 
 STEERING = SteeringState.STEERING
 
 
 def test_a_tip_leads_to_one_step_and_its_end_awaits_another() -> None:
     rig = Rig()
-    assert where(rig) == (STEERING, Awaiting.TIP)
+    assert state_of(rig) == (STEERING, Awaiting.TIP)
     assert rig.steering.command_ns == 0
     actions = rig.expose()
     step = sent(actions)
@@ -39,14 +39,14 @@ def test_a_tip_leads_to_one_step_and_its_end_awaits_another() -> None:
     assert update.stamp_ns == rig.steering.command_ns == rig.now
     assert update.update.estimate.reduced[0] == pytest.approx(-0.003)
     assert rig.steering.reach is update.update.reach
-    assert where(rig) == (STEERING, Awaiting.RESULT)
+    assert state_of(rig) == (STEERING, Awaiting.RESULT)
     assert none_sent(rig.expose())
     # Answers to other commands are ignored.
     assert rig.steering.on_result(step.stamp_ns - 1, "succeeded") == []
-    assert where(rig) == (STEERING, Awaiting.RESULT)
+    assert state_of(rig) == (STEERING, Awaiting.RESULT)
     assert none_sent(rig.run(step))
     end = rig.now
-    assert where(rig) == (STEERING, Awaiting.TIP)
+    assert state_of(rig) == (STEERING, Awaiting.TIP)
     assert (rig.steering.step, rig.steering.tips.after_ns) == (1, end)
     early = TipMeasurement(end - TICK // 2, "rig", np.array([0.0, 0.0, 0.0009]))
     assert rig.steering.on_tip(early) == []
@@ -55,36 +55,23 @@ def test_a_tip_leads_to_one_step_and_its_end_awaits_another() -> None:
     assert rig.steering.insertion == pytest.approx(0.001)
 
 
-def test_a_tip_waits_for_its_joints() -> None:
-    rig = Rig()
-    rig.now += TICK
-    assert rig.steering.on_tip(rig.measured()) == []
-    assert where(rig) == (STEERING, Awaiting.TIP)
-    rig.run(sent(rig.joints()))
-    # Joints interpolated at the exposure, between two samples.
-    rig.now += TICK
-    tip = TipMeasurement(rig.now - TICK // 2, "rig", np.array([0.0, 0.0, 0.001]))
-    assert rig.steering.on_tip(tip) == []
-    assert sent(rig.joints()).stamp_ns == tip.stamp_ns
-
-
 def test_without_hold_no_tip_is_used_and_after_it_a_fresh_one() -> None:
     rig = Rig(held=False)
     for _ in range(2):
-        assert where(rig) == (STEERING, Awaiting.HOLD)
+        assert state_of(rig) == (STEERING, Awaiting.HOLD)
         assert none_sent(rig.expose())
-        assert rig.steering.on_device(HELD) == []
-        assert where(rig) == (STEERING, Awaiting.TIP)
+        assert rig.steering.on_device(HOLD) == []
+        assert state_of(rig) == (STEERING, Awaiting.TIP)
         assert rig.steering.tips.after_ns == rig.now
         # A step waits for a moving device; a release discards it.
         rig.steering.on_device(MOVING)
         assert none_sent(rig.expose())
-        assert where(rig) == (STEERING, Awaiting.DEVICE)
+        assert state_of(rig) == (STEERING, Awaiting.DEVICE)
         assert none_sent(rig.steering.on_device(FREE))
     rig.steering.on_device(MOVING)
     rig.expose()
-    sent(rig.steering.on_device(HELD))
-    assert where(rig) == (STEERING, Awaiting.RESULT)
+    sent(rig.steering.on_device(HOLD))
+    assert state_of(rig) == (STEERING, Awaiting.RESULT)
 
 
 def test_an_aborted_step_resumes_from_where_the_joints_are() -> None:
@@ -93,11 +80,11 @@ def test_an_aborted_step_resumes_from_where_the_joints_are() -> None:
     rig.steering.on_device(FREE)
     said = rig.run(step, part=0.3, text="aborted: hold released")
     assert logged(said) == "step 1 aborted: hold released"
-    assert where(rig) == (STEERING, Awaiting.HOLD)
+    assert state_of(rig) == (STEERING, Awaiting.HOLD)
     assert rig.steering.step == 0
     assert rig.steering.reason == "step aborted: hold released"
     assert none_sent(rig.expose())
-    rig.steering.on_device(HELD)
+    rig.steering.on_device(HOLD)
     assert sent(rig.expose()).insertion == pytest.approx(0.0003 + 0.001)
 
 
@@ -165,13 +152,13 @@ def test_motion_since_the_exposure_requires_a_new_tip() -> None:
             rig.rotation += turned
             rig.settle(1)
             if waiting == "for the device":
-                actions = rig.steering.on_device(HELD)
+                actions = rig.steering.on_device(HOLD)
             else:
                 actions = rig.steering.on_tip(early)
                 assert (rig.steering.tips.last is last) is looked_at_anew
             assert none_sent(actions) is looked_at_anew, waiting
             if looked_at_anew:
-                assert where(rig) == (STEERING, Awaiting.TIP)
+                assert state_of(rig) == (STEERING, Awaiting.TIP)
                 assert sent(rig.expose()).insertion == pytest.approx(rig.insertion + 0.001)
 
 
@@ -186,7 +173,7 @@ def test_the_last_step_ends_at_the_depth() -> None:
             rig.run(step)
     np.testing.assert_allclose(ends, [(0.001, 0.5), (0.002, 0.5), (0.0025, 0.25)])
     assert ends[-1][0] == rig.steering.insertion == 0.0025
-    assert where(rig) == (SteeringState.DONE, Awaiting.NOTHING)
+    assert state_of(rig) == (SteeringState.DONE, Awaiting.NOTHING)
     # The reason contains the confidence: the needle ends away from the plane.
     assert "insertion 0.0025 m reached; r1 = " in rig.steering.reason
     assert "m (95 %), doubtful: " in rig.steering.reason
@@ -223,7 +210,7 @@ def test_a_failing_part_of_another_package_is_a_fault(monkeypatch: pytest.Monkey
         broken.setattr(rig.steering.control, "update", fail)
         (log,) = rig.expose()
     assert logged([log]) == "FAULT: advance() raised RuntimeError"
-    assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
+    assert state_of(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
     # A later tip causes no motion either.
     assert none_sent(rig.expose())
     assert rig.start() == "steering"

@@ -47,7 +47,6 @@ def test_bad_messages_are_rejected_whatever_the_joints() -> None:
         # The first tip has no predecessor.
         first = None if wanted is TipFault.NOT_NEWER else wanted
         assert fault(check_message(measured, None)) is first, measured
-    assert "(4e-08 s behind)" in str(check_message(tip(0.0, 0.0, 0.0, stamp_ns=10), LAST))
 
 
 def test_stamps_outside_the_joint_history_are_rejected() -> None:
@@ -61,8 +60,6 @@ def test_stamps_outside_the_joint_history_are_rejected() -> None:
         measured = tip(0.0, 0.0, 0.0, stamp_ns=stamp_ns)
         assert fault(check_stamp(measured, oldest, latest)) is wanted, stamp_ns
         assert check_stamp(measured, None, None) is None
-    late = tip(0.0, 0.0, 0.0, stamp_ns=60 + 5 * SECOND // 2)
-    assert "2.5 s ahead" in str(check_stamp(late, oldest, latest))
 
 
 def test_unreachable_positions_are_rejected() -> None:

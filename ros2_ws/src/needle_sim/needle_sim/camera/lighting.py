@@ -14,8 +14,8 @@ _BLOTCH_SIZE = 0.13
 _COARSE = 16
 _SIDE = 0.05
 _LENGTHS = (0.0, 0.140)
-_WAY_SIDE = 0.006
-_WAY_LENGTHS = (0.02, 0.115)
+_NEEDLE_SIDE = 0.006
+_NEEDLE_LENGTHS = (0.02, 0.115)
 _SLIMNESS = (0.12, 0.5)
 _FLICKER_PERIOD = 23.0
 _SHINE_LENGTHS = (0.0015, 0.0045)
@@ -71,8 +71,8 @@ def surface_glints(glints: Glints, optics: Optics, rng: np.random.Generator) -> 
     count = glints.on_surface + glints.over_needle
     over = np.arange(count) >= glints.on_surface
     aside, along = rng.uniform(-_SIDE, _SIDE, count), rng.uniform(*_LENGTHS, count)
-    aside[over] = rng.uniform(-_WAY_SIDE, _WAY_SIDE, glints.over_needle)
-    along[over] = rng.uniform(*_WAY_LENGTHS, glints.over_needle)
+    aside[over] = rng.uniform(-_NEEDLE_SIDE, _NEEDLE_SIDE, glints.over_needle)
+    along[over] = rng.uniform(*_NEEDLE_LENGTHS, glints.over_needle)
     place = optics.points_on_face(aside, along)
     half = glints.largest / 2.0 * rng.uniform(0.15, 1.0, count) ** 1.5
     half[over] = glints.largest / 2.0 * rng.uniform(0.5, 1.0, glints.over_needle)

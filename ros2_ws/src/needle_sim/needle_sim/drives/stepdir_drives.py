@@ -82,8 +82,8 @@ class StepdirDrive(TextDrive):
         """Move to the target on a trapezoid, or brake; a switch blocks its direction."""
         if self.target is not None:
             # The outer switch is the negative one.
-            way = -self.outer * (self.target - self.demand.position)
-            if self.motor.is_blocked(way):
+            towards_switch = -self.outer * (self.target - self.demand.position)
+            if self.motor.is_blocked(towards_switch):
                 self.target = None
         ramp = self.deceleration
         if self.target is None:

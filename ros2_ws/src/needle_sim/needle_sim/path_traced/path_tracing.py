@@ -160,7 +160,7 @@ class PathTracer:
             Mean radiance of a pixel's paths; paths that hit the floor first count as 0.
         cover : ndarray, shape (N,)
             Share of the paths that hit another object first.
-        way : ndarray, shape (N,)
+        distance : ndarray, shape (N,)
             Length of these paths, averaged over all paths: distance times `cover` [m].
         """
         parts = [
@@ -172,8 +172,8 @@ class PathTracer:
         ]
         if not parts:
             return np.zeros(0), np.zeros(0), np.zeros(0)
-        light, cover, way = (np.concatenate(which) for which in zip(*parts, strict=True))
-        return light, cover, way
+        light, cover, distance = (np.concatenate(which) for which in zip(*parts, strict=True))
+        return light, cover, distance
 
     def covered(
         self, scene: Scene, pixels: PixelArray, camera: SimulatedCamera, rig: StereoRig
@@ -268,9 +268,9 @@ class PathTracer:
         light, _, _ = self._integrator.sample(scene.tracer, sampler, ray, None, before)
         cover = self._dr.select(before, mi.Float(1.0), 0.0)
         bounded = self._dr.select(before, self._dr.minimum(light.x, _MAX_RADIANCE), 0.0)
-        way = self._dr.select(before, hit.t / MM, 0.0)
+        distance = self._dr.select(before, hit.t / MM, 0.0)
         mean = self._mean
-        return mean(bounded, samples), mean(cover, samples), mean(way, samples)
+        return mean(bounded, samples), mean(cover, samples), mean(distance, samples)
 
     def _hits_object(self, hit: Any, scene: Scene) -> Any:
         """Return which rays hit an object other than a floor."""

@@ -219,12 +219,13 @@ class PathTracedRenderer:
     ) -> None:
         """Set light and cover of pixels, (N, 2), that show objects in front of the backdrop."""
         there = (pixels[:, 1], pixels[:, 0])
-        seen, covered, way = self._tracer.layer(
+        radiance, covered, distance = self._tracer.layer(
             scene, pixels, view.optics.camera, self._rig, samples=samples, key=key
         )
-        clear = _transmission(self._look.haze, way / np.maximum(covered, 1e-9) / view.backdrop.gel)
+        path_share = distance / np.maximum(covered, 1e-9) / view.backdrop.gel
+        clear = _transmission(self._look.haze, path_share)
         clear = np.where(view.in_air[there], 1.0, clear)
-        light[there] = clear * seen + (1.0 - clear) * covered * view.veil
+        light[there] = clear * radiance + (1.0 - clear) * covered * view.veil
         cover[there] = covered
 
     def _view(self, camera: SimulatedCamera, behind: Backdrop, side: int) -> _View:
@@ -314,9 +315,9 @@ class _View:
         return np.asarray(there, dtype=np.float32)
 
 
-def _transmission(haze: float, way: FloatArray | float) -> FloatArray:
+def _transmission(haze: float, path_share: FloatArray | float) -> FloatArray:
     """Return the transmitted share of light after a share of the path through the phantom."""
-    return np.asarray((1.0 - haze) ** np.minimum(way, 1.0))
+    return np.asarray((1.0 - haze) ** np.minimum(path_share, 1.0))
 
 
 def _needle_pixels(optics: Optics, needle: NeedleMesh) -> NDArray[np.int64]:

@@ -52,11 +52,11 @@ def _camera(
     apparent = inner / gel + wall / acrylic
     focal = max(float(rng.uniform(*_FOCAL_PX)), scale * (_MIN_AIR + apparent))
     along = np.array([0.0, 0.0, 1.0])
-    seen = along * (_SIZE[0] / 2.0 - rng.uniform(*_BEFORE_ENTRY_PX)) / scale
+    view_centre = along * (_SIZE[0] / 2.0 - rng.uniform(*_BEFORE_ENTRY_PX)) / scale
     aside = np.append(rng.uniform(-_MAX_OFFSET, _MAX_OFFSET, 2), 0.0) * (1.0 - np.abs(axis))
-    centre = seen + aside + (inner + wall + focal / scale - apparent) * axis
+    centre = view_centre + aside + (inner + wall + focal / scale - apparent) * axis
     centre[2] += rng.uniform(-_MAX_OFFSET, _MAX_OFFSET)
-    ahead = seen - centre
+    ahead = view_centre - centre
     ahead /= np.linalg.norm(ahead)
     down = np.cross(ahead, along)
     down /= np.linalg.norm(down)
@@ -78,7 +78,7 @@ def _camera(
             "rotation": _floats(turned.as_quat()),
         },
         "window": {
-            "point": _floats(seen + (inner + wall) * axis),
+            "point": _floats(view_centre + (inner + wall) * axis),
             "normal": _floats(normal),
             "layers": [{"thickness": wall, "refractive_index": acrylic}],
             "inside": gel,

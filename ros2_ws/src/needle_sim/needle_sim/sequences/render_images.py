@@ -83,12 +83,12 @@ def render_images(given: argparse.Namespace) -> int:
     seed = whole_number("--seed", given.seed, 0, 2**31 - 1)
     look = _look(given, seed)
     curvature = number("--curvature", given.curvature, 0.0, 100.0, "1/m")
-    way = {"depth": depth, "step": step, "begin": begin, "curvature": curvature, "frames": frames}
+    path = {"depth": depth, "step": step, "begin": begin, "curvature": curvature, "frames": frames}
     output, summary = Path(given.output).expanduser(), output_file("--json", given.json)
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         calibration = _calibration(given, seed, Path(folder))
-        written = _write(look, seed, way, output, calibration)
+        written = _write(look, seed, path, output, calibration)
         is_silent = not sys.stderr.isatty()
         for _ in tqdm(
             written, total=frames, unit="pair", delay=1.0, leave=False, disable=is_silent
@@ -142,23 +142,23 @@ def _calibration(given: argparse.Namespace, seed: int, folder: Path) -> Path:
 
 
 def _write(
-    look: Scenario | Appearance, seed: int, way: Mapping[str, Any], output: Path, calibration: Path
+    look: Scenario | Appearance, seed: int, path: Mapping[str, Any], output: Path, calibration: Path
 ) -> Iterator[None]:
     """Write the pairs, one per iteration."""
     rig = load_stereo_rig(calibration)
     columns: tuple[str, ...] = ()
     pairs: Iterator[RenderedPair]
     if isinstance(look, Scenario):
-        pairs = render_insertion(rig, look, seed=seed, **way)
+        pairs = render_insertion(rig, look, seed=seed, **path)
     else:
-        columns, pairs = TRUTH_COLUMNS, trace_insertion(load_mitsuba(), rig, look, **way)
+        columns, pairs = TRUTH_COLUMNS, trace_insertion(load_mitsuba(), rig, look, **path)
     with contextlib.closing(ImageFolder(output, calibration, columns)) as folder:
         for pair in pairs:
             more: Sequence[float | str] = ()
             if isinstance(look, Appearance) and isinstance(pair, TracedPair):
                 more = truth_values(look, pair)
-            seen = pair.visible_share
-            folder.write(pair.number, pair.images, pair.insertion, pair.truth, seen, more=more)
+            visible = pair.visible_share
+            folder.write(pair.number, pair.images, pair.insertion, pair.truth, visible, more=more)
             yield
 
 

@@ -108,7 +108,7 @@ class Disturbances:
         Share of exposures in which the tip is detected.
     delay : int
         Delay of a measurement in steps; the controller receives its age.
-    untold_delay : int
+    hidden_delay : int
         Delay in steps that is hidden from the controller: the measurement appears to be new.
     curvature_scale : float
         Curvature of the plant as a multiple of the controller's assumption.
@@ -143,7 +143,7 @@ class Disturbances:
     outlier_size: tuple[float, float] = (0.005, 0.010)
     found: float = 1.0
     delay: int = 0
-    untold_delay: int = 0
+    hidden_delay: int = 0
     curvature_scale: float = 1.0
     curvature_patches: float = 0.0
     layer: tuple[float, float] = (1.0, 0.0)
@@ -179,28 +179,28 @@ def measured(
         The measured tips [m]; NaN where missing.
     """
     count = len(tips)
-    seen = np.empty((count, 3))
+    noisy = np.empty((count, 3))
     if disturbances.noise_shape == "normal":
         lasting = disturbances.noise_lasting
-        seen[:] = tips + disturbances.noise * _normal_errors(lasting, seed, exposure, first, count)
+        noisy[:] = tips + disturbances.noise * _normal_errors(lasting, seed, exposure, first, count)
     else:
         share = uniform_numbers(seed, NOISE, exposure, first, count)
         if disturbances.noise_shape == "student":
             level = quantile_levels(share[:, :3])
             errors = scipy.special.stdtrit(disturbances.degrees_of_freedom, level)
-            seen[:] = tips + disturbances.noise * errors
+            noisy[:] = tips + disturbances.noise * errors
         else:
-            _add_noise(tips, share, disturbances.noise, seen)
+            _add_noise(tips, share, disturbances.noise, noisy)
     if exposure == 0:
-        return seen
+        return noisy
     if disturbances.outliers > 0.0:
         chance = uniform_numbers(seed, OUTLIER, exposure, first, count)[:, 0]
         off = tips + _outliers(disturbances.outlier_size, seed, exposure, first, count)
-        seen = np.where((chance < disturbances.outliers)[:, np.newaxis], off, seen)
+        noisy = np.where((chance < disturbances.outliers)[:, np.newaxis], off, noisy)
     if disturbances.found < 1.0:
         chance = uniform_numbers(seed, MISSED, exposure, first, count)[:, 0]
-        seen[chance < 1.0 - disturbances.found] = np.nan
-    return seen
+        noisy[chance < 1.0 - disturbances.found] = np.nan
+    return noisy
 
 
 def patch_factors(patches: float, seed: int, patch: int, first: int, count: int) -> FloatArray:
@@ -305,11 +305,11 @@ class DelayLine:
 
 @compiled
 def _add_noise(
-    tips: FloatArray, share: NDArray[np.float32], amplitude: float, seen: FloatArray
+    tips: FloatArray, share: NDArray[np.float32], amplitude: float, noisy: FloatArray
 ) -> None:
     for i in range(tips.shape[0]):
         for j in range(3):
-            seen[i, j] = tips[i, j] + amplitude * (2.0 * share[i, j] - 1.0)
+            noisy[i, j] = tips[i, j] + amplitude * (2.0 * share[i, j] - 1.0)
 
 
 def _normal_errors(lasting: float, seed: int, exposure: int, first: int, count: int) -> FloatArray:

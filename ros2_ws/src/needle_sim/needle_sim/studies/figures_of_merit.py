@@ -256,7 +256,7 @@ def figures(outcomes: Outcomes) -> dict[str, float | None]:
         "inside_3_sigma": mean_or_none(outcomes.inside_3_sigma),
         "x_inside_3_sigma": mean_or_none(outcomes.x_inside_3_sigma),
         "doubtful_at_end": mean_or_none(is_doubtful(outcomes.missed)),
-        "trusted_far_off": trusted_far_off(outcomes.x_end, outcomes.missed),
+        "trusted_far_off": undoubted_misses(outcomes.x_end, outcomes.missed),
     }
 
 
@@ -266,7 +266,7 @@ def mean_or_none(values: FloatArray) -> float | None:
     return None if np.isnan(mean) else mean
 
 
-def trusted_far_off(distance: FloatArray, missed: FloatArray) -> float | None:
+def undoubted_misses(distance: FloatArray, missed: FloatArray) -> float | None:
     """Return the number of undoubted runs that end beyond `FAR_OFF`; None without estimates.
 
     Parameters

@@ -261,7 +261,7 @@ class DisturbedNeedles:
         self._patch = -1
         self._insertions = 0
         self._exposure = 0
-        self._hidden_delay = DelayLine(wrong.untold_delay)
+        self._hidden_delay = DelayLine(wrong.hidden_delay)
         self._delay = DelayLine(wrong.delay)
 
     def measure_first(self) -> FloatArray:

@@ -23,7 +23,7 @@ from needle_sim.studies.figures_of_merit import (
     concatenate,
     is_doubtful,
     mean_or_none,
-    trusted_far_off,
+    undoubted_misses,
 )
 from needle_sim.studies.needles import DisturbedNeedles
 from needle_sim.studies.study import CHUNK, Controller, StudySettings, needle_chunks
@@ -207,7 +207,7 @@ def point_figures(outcomes: PointOutcomes) -> dict[str, float | None]:
         "inside_2_sigma": mean_or_none(outcomes.inside_2_sigma),
         "inside_3_sigma": mean_or_none(outcomes.inside_3_sigma),
         "doubtful_at_end": mean_or_none(is_doubtful(outcomes.missed)),
-        "trusted_far_off": trusted_far_off(outcomes.error, outcomes.missed),
+        "trusted_far_off": undoubted_misses(outcomes.error, outcomes.missed),
     }
 
 

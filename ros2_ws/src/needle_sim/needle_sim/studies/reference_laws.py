@@ -182,10 +182,10 @@ def arc_to(
     bend : ndarray, shape (3,), written
         Curvature times bending direction [1/m].
     """
-    way = goal - place
-    ahead = way @ heading
-    square = way @ way
-    bend[:] = 2.0 / max(float(square), 1e-30) * (way - ahead * heading)
+    offset = goal - place
+    ahead = offset @ heading
+    square = offset @ offset
+    bend[:] = 2.0 / max(float(square), 1e-30) * (offset - ahead * heading)
     size = math.sqrt(bend @ bend)
     if ahead <= 0.0 or size > curvature:
         return math.inf

@@ -51,8 +51,6 @@ GONE = object()
 # Key in the file, invalid value, and key in the error.
 BAD = [
     ("phantom", GONE, "phantom.surface_height is missing"),
-    ("left.camera_matrix", GONE, "left.camera_matrix.data is missing"),
-    ("right.T_optical_rig.rotation", GONE, "right.T_optical_rig.rotation is missing"),
     ("phantom.refractive_index", 0.9, "phantom.refractive_index = 0.9 is below 1"),
     ("phantom.surface_height", float("nan"), "surface_height = nan is not 1 finite number"),
     ("phantom.surface_height", 0.6, "left.T_optical_rig puts the camera behind its window"),
@@ -64,8 +62,6 @@ BAD = [
 ]
 BAD_WINDOWS = [
     ("right.window", GONE, "phantom.surface_height is missing"),
-    ("left.window.layers", GONE, "left.window.layers is missing"),
-    ("left.window.normal", [1, 1, 0], "normal has length 1.41"),
     ("left.window.normal", [-1, 0, 0], "puts the camera behind its window"),
     ("left.window.layers.0.thickness", -1, "left.window.layers.0.thickness = -1 is below 0"),
 ]
@@ -90,18 +86,4 @@ def test_a_bad_file_is_named_in_one_line(
         with pytest.raises(UserError, match=named) as raised:
             load_stereo_rig(path)
         assert "bad.yaml" in str(raised.value)
-        assert "\n" not in str(raised.value)
-
-
-def test_a_file_that_cannot_be_read_is_named_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"absent\.yaml: cannot be read: No such file"):
-        load_stereo_rig(tmp_path / "absent.yaml")
-    broken = tmp_path / "broken.yaml"
-    for text, named in (
-        ("left: [1, 2\nright: }", "not YAML in line 2"),
-        ("", "left.image_width is missing"),
-    ):
-        broken.write_text(text)
-        with pytest.raises(UserError, match=named) as raised:
-            load_stereo_rig(broken)
         assert "\n" not in str(raised.value)

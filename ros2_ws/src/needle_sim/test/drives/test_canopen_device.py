@@ -37,7 +37,6 @@ def test_each_drive_boots_identifies_itself_and_reboots_after_a_reset(
         (0x701, b"\0"),
         (0x702, b"\0"),
     ]
-    assert master.nodes[INSERTION].sdo.upload(0x1008, 0) == b"Emulated insertion drive"
     assert master.read(0x1000) == 0x00040192
     assert master.read(0x1000, node=ROTATION) == 0x00020192
     assert master.read(0x6502) == 0b10100001

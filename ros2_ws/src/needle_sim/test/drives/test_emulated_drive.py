@@ -107,16 +107,22 @@ def test_profile_position_ends_at_the_target_in_the_time_of_a_trapezoid(master: 
         assert master.read(0x6064, node=ROTATION) == target
 
 
-def test_the_next_profile_target_waits_for_the_first_and_relative_ones_add(
+def test_the_next_profile_target_waits_for_the_first_and_a_relative_one_adds(
     master: Master,
 ) -> None:
     master.enable(PP)
-    for relative in (1_000, 500):
-        master.target(relative)
-        master.control(0x0F, 0x5F)
-    master.sync(200)
-    # Both relative to the position of the drive when they arrived.
-    assert master.read(0x6064) == 500
+    for target in (1_000, 500):
+        master.target(target)
+        master.control(0x0F, 0x1F)
+    passed = []
+    for _ in range(200):
+        master.sync()
+        passed.append(master.read(0x6064))
+    assert (max(passed), passed[-1]) == (1_000, 500)
+    master.target(-100)
+    master.control(0x0F, 0x5F)
+    master.sync(100)
+    assert master.read(0x6064) == 400
 
 
 @pytest.mark.parametrize("start", [2_345.5, -1.0, -5_000.0])

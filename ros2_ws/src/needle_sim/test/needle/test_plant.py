@@ -166,26 +166,6 @@ def test_the_centreline_is_the_path_at_equal_distances() -> None:
     np.testing.assert_allclose(distance, 0.06 / (len(line) - 1), rtol=1e-5)
 
 
-def test_broadcasting_equals_looping() -> None:
-    rng = np.random.default_rng(5)
-    starts = np.stack([initial_pose(p, r) for p, r in rng.uniform(-0.3, 0.3, (2, 2))])[:, None]
-    curvature = rng.uniform(5.0, 10.0, (2, 3))
-    play, lag = rng.uniform(0.0, 0.2, (2, 3)), np.array([[0.0, 0.004, 0.01]])
-    many = NeedlePlant(
-        np.tile(starts, (1, 3, 1, 1)), curvature=curvature, torsion=Torsion(play, lag)
-    )
-    inputs = rng.uniform([0.0, -0.5], [0.002, 0.5], (10, 2, 3, 2))
-    for each in inputs:
-        many.advance(each[..., 0], each[..., 1])
-    for row, column in np.ndindex(2, 3):
-        torsion = Torsion(play[row, column], lag[0, column])
-        one = NeedlePlant(starts[row, 0], curvature=curvature[row, column], torsion=torsion)
-        for each in inputs:
-            one.advance(*each[row, column])
-        np.testing.assert_allclose(many.T_rig_tip[row, column], one.T_rig_tip, rtol=0, atol=1e-14)
-        assert many.rotation[row, column] == pytest.approx(float(one.rotation))
-
-
 def test_an_invalid_parameter_is_rejected_and_changes_nothing() -> None:
     plant = NeedlePlant(np.eye(4), curvature=CURVATURE)
     for inputs in ((np.nan, 0.0), (0.001, np.inf)):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from needle_sim.needle.se3 import exp_twist, rotation_about_y, rotation_about_z
+from needle_sim.needle.se3 import exp_twist
 
 ANGLES = (0.0, 1e-12, 1e-3, 0.2999, 0.3001, 3.1, 6.0)
 
@@ -26,13 +26,6 @@ def test_twists_of_any_angle_one_or_many_have_the_matrix_exponential() -> None:
     for index in np.ndindex(10, len(ANGLES)):
         np.testing.assert_allclose(together[index], exponential(twists[index]), rtol=0, atol=3e-14)
     np.testing.assert_allclose(exp_twist(twists[0, 1]), together[0, 1], rtol=0, atol=1e-15)
-
-
-def test_rotations_about_an_axis_are_exponentials() -> None:
-    for angle in (-3.0, 0.0, 1.0):
-        for rotation, axis in ((rotation_about_y, 4), (rotation_about_z, 5)):
-            expected = exponential(angle * np.eye(6)[axis])
-            np.testing.assert_allclose(rotation(angle), expected, atol=1e-14)
 
 
 def test_a_twist_of_another_length_is_refused() -> None:

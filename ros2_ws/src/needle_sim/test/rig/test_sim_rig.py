@@ -81,8 +81,6 @@ def test_at_level_drive_motors_move_the_needle_and_its_exit_triggers_the_stop() 
         ({"level": "camera", "calibration_file": "/nowhere.yaml"}, "/nowhere.yaml"),
         # Hard caps cannot be configured away.
         ({"max_speed": 0.006}, "max_speed"),
-        ({"max_step_length": 1.0}, "max_step_length"),
-        ({"hold_timeout": 1.0}, "hold_timeout"),
     ],
 )
 def test_bad_parameters_are_refused_in_one_line(parameters: dict[str, Any], message: str) -> None:

@@ -121,7 +121,6 @@ def test_angles_of_the_truth_give_the_directions_back() -> None:
     [
         (["--scenario", "fog"], "scenario 'fog' is not one of clean"),
         (["--frames", "0"], "--frames = 0 is outside [1, 999999]"),
-        (["--frames", "many"], "--frames 'many' is not a whole number"),
         (["--seed", "-1"], "--seed"),
         (["--depth-mm", "nan"], "--depth-mm = nan mm is not finite"),
         (["--step-mm", "0"], "--step-mm = 0 mm is outside"),
@@ -134,7 +133,6 @@ def test_angles_of_the_truth_give_the_directions_back() -> None:
         ([*TRACED, "--appearance", "fog"], "appearance 'fog' is not one of random"),
         # No Mitsuba.
         (TRACED, "renderer path_traced needs Mitsuba 3, which is not installed"),
-        (["--what"], "unrecognized arguments: --what; see --help"),
         (["--json", "/nowhere/done.json"], "--json /nowhere/done.json"),
     ],
 )

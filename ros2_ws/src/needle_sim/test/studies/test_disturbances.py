@@ -8,8 +8,6 @@ from scipy import stats
 
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.disturbances import (
-    CURVATURE,
-    NOISE,
     BiasWalk,
     DelayLine,
     Disturbances,
@@ -18,7 +16,6 @@ from needle_sim.studies.disturbances import (
     patch_factors,
     push_axes,
     roll_steps,
-    uniform_numbers,
 )
 
 COUNT = 4000
@@ -145,12 +142,3 @@ def test_a_late_measurement_has_its_age(steps: int) -> None:
         else:
             np.testing.assert_array_equal(tips, exposure - steps)
             assert age == pytest.approx(0.001 * steps)
-
-
-def test_random_numbers_of_a_needle_do_not_depend_on_other_needles() -> None:
-    for first in (40, 41):
-        for purpose in (NOISE, CURVATURE):
-            whole = uniform_numbers(3, purpose, 7, 0, 100)
-            some = uniform_numbers(3, purpose, 7, first, 5)
-            np.testing.assert_array_equal(some, whole[first : first + 5])
-    np.testing.assert_array_equal(bumps(0.002, 1, 40, 5), bumps(0.002, 1, 0, 100)[40:45])

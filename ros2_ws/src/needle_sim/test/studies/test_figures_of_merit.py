@@ -12,7 +12,7 @@ from needle_sim.studies.figures_of_merit import (
     concatenate,
     figures,
     is_doubtful,
-    trusted_far_off,
+    undoubted_misses,
 )
 
 
@@ -70,9 +70,9 @@ def test_figures_of_known_runs() -> None:
 
 def test_distant_ends_with_high_confidence_are_counted_on_both_sides() -> None:
     distance = np.array([0.0, 0.0049, 0.0051, -0.0051, -0.02])
-    assert trusted_far_off(distance, np.zeros(5)) == 3.0
-    assert trusted_far_off(distance, np.array([0.0, 0.0, 1.0, 0.0, 1.0])) == 1.0
-    assert trusted_far_off(distance, np.full(5, np.nan)) is None
+    assert undoubted_misses(distance, np.zeros(5)) == 3.0
+    assert undoubted_misses(distance, np.array([0.0, 0.0, 1.0, 0.0, 1.0])) == 1.0
+    assert undoubted_misses(distance, np.full(5, np.nan)) is None
 
 
 def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:

@@ -98,17 +98,6 @@ def test_random_starts_are_uniform_within_the_bounds_and_follow_the_seed() -> No
     assert not np.any(np.all(starts == GRIDS["random"](BOUNDS, 2, 2), axis=1))
 
 
-def test_an_unsteered_needle_ends_at_the_end_of_its_arc() -> None:
-    # In closed form: x = x0 + sin(pitch) sin(kl)/k + cos(pitch) sin(roll) (1 - cos(kl))/k.
-    start = np.array([[-0.003, np.deg2rad(2.0), np.deg2rad(15.0)]])
-    bend, (_, pitch, roll) = CURVATURE * 0.120, start[0]
-    along, across = np.sin(bend) / CURVATURE, (1.0 - np.cos(bend)) / CURVATURE
-    expected = -0.003 + np.sin(pitch) * along + np.cos(pitch) * np.sin(roll) * across
-    _, found = watched(start)
-    assert found.x_end[0] == pytest.approx(expected, abs=1e-9)
-    assert (found.rotation[0], found.x_start[0]) == (0.0, -0.003)
-
-
 @pytest.mark.parametrize(
     ("wrong", "curvature", "length"),
     [
@@ -124,6 +113,7 @@ def test_curvature_and_slip_act_on_the_needle(
     watching, found = watched(LEVEL, disturbances=Disturbances(**wrong))  # type: ignore[arg-type]
     bend = curvature * length
     assert found.x_end[0] == pytest.approx((1.0 - np.cos(bend)) / curvature, abs=1e-9)
+    assert (found.rotation[0], found.x_start[0]) == (0.0, 0.0)
     assert watching.tips[-1][0, 2] == pytest.approx(np.sin(bend) / curvature, abs=1e-9)
     assert np.sum(watching.lengths) == pytest.approx(0.120)
 
@@ -217,7 +207,7 @@ def test_a_bump_moves_the_needle_once_at_half_the_depth_and_not_the_plane() -> N
 
 def test_tips_with_a_hidden_delay_appear_to_be_new() -> None:
     prompt, _ = watched(STARTS[:3], depth=0.010)
-    both, _ = watched(STARTS[:3], depth=0.010, disturbances=Disturbances(delay=2, untold_delay=1))
+    both, _ = watched(STARTS[:3], depth=0.010, disturbances=Disturbances(delay=2, hidden_delay=1))
     assert np.all(np.isnan(both.tips[:3]))
     np.testing.assert_array_equal(both.tips[3:], prompt.tips[:-3])
     np.testing.assert_allclose(both.ages, [0.0] * 2 + [0.002] * 8)

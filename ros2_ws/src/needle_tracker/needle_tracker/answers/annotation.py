@@ -26,7 +26,7 @@ _SCALE = 0.5
 _GREEN, _YELLOW, _RED = (90, 230, 90), (255, 220, 60), (255, 80, 60)
 _SHAFT_PX = 40.0
 _SHIFT = 4  # fractional bits of coordinates for drawing
-_BAR_PX = 44
+_CAPTION_PX = 44
 
 
 def shows_end(end: ImageEnd | None) -> bool:
@@ -73,7 +73,7 @@ def annotate(left: Image, right: Image, measured: Measurement) -> Image:
     ]
     height = max(view.shape[0] for view in views)
     views = [cv2.copyMakeBorder(v, 0, height - len(v), 0, 2, cv2.BORDER_CONSTANT) for v in views]
-    picture = cv2.copyMakeBorder(np.hstack(views), 0, _BAR_PX, 0, 0, cv2.BORDER_CONSTANT)
+    picture = cv2.copyMakeBorder(np.hstack(views), 0, _CAPTION_PX, 0, 0, cv2.BORDER_CONSTANT)
     starts = (0, views[0].shape[1])
     for start, end in zip(starts, measured.ends, strict=True):
         _write(picture, describe_view(end), start, height + 16)
@@ -85,13 +85,13 @@ def describe(measured: Measurement) -> str:
     """Return one line of text: the state, and the tip or the reason for none."""
     if measured.tip is None:
         return f"{measured.state.value}: {missing(measured)}"
-    place = ", ".join(
+    position = ", ".join(
         f"{axis} {1e3 * value:.2f} +- {1e3 * math.sqrt(variance):.2f}"
         for axis, value, variance in zip(
             "xyz", measured.tip.position, np.diag(measured.tip.covariance), strict=True
         )
     )
-    return f"{measured.state.value}: {place} mm" + (
+    return f"{measured.state.value}: {position} mm" + (
         f" ({measured.reason})" if measured.reason else ""
     )
 

@@ -58,8 +58,8 @@ class DetectionCounts:
 
     def figures(self) -> dict[str, JsonValue]:
         """Return the counts by the keys of `track_images --json`."""
-        seen = {f"{side}_end_seen": self.ends[side] for side in SIDES}
-        return {**seen, **{f"{side}_shaft_seen": self.shafts[side] for side in SIDES}}
+        ends = {f"{side}_end_seen": self.ends[side] for side in SIDES}
+        return {**ends, **{f"{side}_shaft_seen": self.shafts[side] for side in SIDES}}
 
 
 class TruthComparison:
@@ -115,19 +115,19 @@ class TruthComparison:
 
     def describe(self) -> str:
         """Return the figures as text."""
-        seen = self.figures()
+        figures = self.figures()
         lines = [
-            f"against the truth: {seen['compared']} tips, {seen['missed']} needles without a tip, "
-            f"{seen['tips_without_needle']} tips without a needle"
+            f"against the truth: {figures['compared']} tips, {figures['missed']} needles without "
+            f"a tip, {figures['tips_without_needle']} tips without a needle"
         ]
-        if seen["compared"]:
-            axes = ", ".join(f"{axis} {seen[f'error_{axis}_rms_mm']:.3f}" for axis in "xyz")
+        if figures["compared"]:
+            axes = ", ".join(f"{axis} {figures[f'error_{axis}_rms_mm']:.3f}" for axis in "xyz")
             lines += [
-                f"  error  {seen['error_rms_mm']:.3f} mm rms ({axes}), "
-                f"{seen['error_p95_mm']:.3f} mm (95th percentile), "
-                f"{seen['error_max_mm']:.3f} mm at worst",
-                f"  that is {seen['error_sigmas']:.2f} claimed standard deviations (ideal: 1); "
-                f"{seen['inside_95']:.1%} lie within the claimed 95 % region",
+                f"  error  {figures['error_rms_mm']:.3f} mm rms ({axes}), "
+                f"{figures['error_p95_mm']:.3f} mm (95th percentile), "
+                f"{figures['error_max_mm']:.3f} mm at worst",
+                f"  that is {figures['error_sigmas']:.2f} claimed standard deviations (ideal: 1); "
+                f"{figures['inside_95']:.1%} lie within the claimed 95 % region",
             ]
         return "\n".join(lines)
 

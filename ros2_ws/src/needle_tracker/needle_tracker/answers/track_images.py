@@ -107,7 +107,7 @@ def _run(given: argparse.Namespace) -> int:
     begin = time.perf_counter()
     rows: list[list[str]] = []
     unusable: list[str] = []
-    without, stage, seen = 0, (0.0, 0.0), DetectionCounts()
+    without, stage, detected = 0, (0.0, 0.0), DetectionCounts()
     swap = SwapWatch(calibration, parameters)
     for pair, insertion, measured in track(pairs, tracker, calibration.sizes, insertions):
         without += insertion is None
@@ -120,14 +120,14 @@ def _run(given: argparse.Namespace) -> int:
                 picture = annotate(pair.left, pair.right, measured)[..., ::-1]
                 cv2.imwrite(str(overlays / f"{Path(pair.name).stem}.jpg"), picture)
         truth.add(pair.names, measured)
-        seen.add(measured)
+        detected.add(measured)
         rows.append(to_row(pair.name, measured))
         stage = measured.stage if measured.tip is not None else stage
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([COLUMNS, *rows])
     write_text(output, text.getvalue())
     found = sum(row[1] == "1" for row in rows)
-    print(f"{found} tips in {len(rows)} pairs: {output}\n{seen.describe()}")
+    print(f"{found} tips in {len(rows)} pairs: {output}\n{detected.describe()}")
     if given.insertion:
         print(f"  stage: zero off by {1e3 * stage[0]:.2f} mm, scale by {100.0 * stage[1]:.2f} %")
     if given.truth:
@@ -151,7 +151,7 @@ def _run(given: argparse.Namespace) -> int:
             "unpaired": len(pairs.unpaired),
             "unreadable": len(unusable),
             "without_insertion": without,
-            **seen.figures(),
+            **detected.figures(),
             "wall_s": time.perf_counter() - begin,
             **(truth.figures() if given.truth else dict.fromkeys(truth.figures())),
         }
@@ -215,16 +215,16 @@ def track(
 def to_row(name: str, measured: Measurement) -> list[str]:
     """Return the CSV line of a pair; a tip from the insertion alone does not count."""
     tip, cause = measured.tip, missing(measured)
-    place = [""] * 8
+    measured_fields = [""] * 8
     if tip is not None and not cause:
         d_x, d_y, d_z = tip.direction.tolist()
         angles = math.asin(min(max(d_x, -1.0), 1.0)), math.atan2(-d_y, d_z)
         values = (*tip.position, *np.sqrt(np.diag(tip.covariance)), *angles)
-        place = [f"{value:.9f}" for value in values]
+        measured_fields = [f"{value:.9f}" for value in values]
     shown: list[str] = []
     for end in measured.ends:
         shown += ["", ""] if end is None else [f"{end.ends:.2f}", f"{end.shaft:.2f}"]
-    return [name, "0" if cause else "1", *place, *shown, cause]
+    return [name, "0" if cause else "1", *measured_fields, *shown, cause]
 
 
 def _new_folder(name: str, text: str) -> Path:

@@ -18,7 +18,7 @@ from needle_core.messages import (
 )
 from needle_tracker.answers.pair_answers import CameraInfoProblem, Frame
 from needle_tracker.optics.calibration import Camera, rotation_matrix
-from needle_tracker.sources.image_encodings import ENCODINGS, WANTED, bytes_per_pixel, grey_image
+from needle_tracker.sources.image_encodings import ENCODINGS, SUPPORTED, bytes_per_pixel, grey_image
 from needle_tracker.sources.image_files import size_problem
 from needle_tracker.stereo.triangulation import SpatialTip
 
@@ -34,9 +34,9 @@ def frame_of(message: Any, side: str, camera: Camera) -> Frame:
     The message is an `Image` of needle_core, rclpy or rosbags, which have the same fields.
     """
     if message.encoding not in ENCODINGS:
-        return Frame(None, f"{side} image is {message.encoding!r}, expected {WANTED}")
-    wanted = camera.width, camera.height
-    if problem := size_problem(side, (message.width, message.height), wanted):
+        return Frame(None, f"{side} image is {message.encoding!r}, expected {SUPPORTED}")
+    expected = camera.width, camera.height
+    if problem := size_problem(side, (message.width, message.height), expected):
         return Frame(None, problem)
     least = message.width * bytes_per_pixel(message.encoding)
     if message.step < least or len(message.data) != message.step * message.height:
@@ -74,8 +74,8 @@ def camera_info_problem(message: Any, side: str, camera: Camera) -> CameraInfoPr
             text = f"{side} camera_info differs from the calibration by {difference:.1f} px"
             return CameraInfoProblem(text)
         return CameraInfoProblem()
-    wanted = f"the calibration for {camera.width}x{camera.height}"
-    return CameraInfoProblem(f"{side} camera_info is for {width}x{height}, {wanted}", True)
+    expected = f"the calibration for {camera.width}x{camera.height}"
+    return CameraInfoProblem(f"{side} camera_info is for {width}x{height}, {expected}", True)
 
 
 def insertion_of(message: JointState) -> float | None:

@@ -28,7 +28,7 @@ from needle_tracker.calibrating.calibration_session import (
     views_in_folders,
 )
 from needle_tracker.calibrating.calibration_start import PairsApartError, describe_apart
-from needle_tracker.calibrating.charuco import CharucoBoard, write_board
+from needle_tracker.calibrating.charuco import CharucoBoard, save_figure, write_board
 from needle_tracker.calibrating.imported_lenses import read_lenses
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_model import LENS, SURFACE, unit_of
@@ -119,7 +119,7 @@ def _run(options: Namespace) -> int:
     lines = [*report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
     print("\n".join(lines))
     save_calibration(options.output, result.calibration, lines)
-    save_figure(rig_figure(result), options.output.with_suffix(".rig.png"))
+    save_figure(rig_figure(result), options.output.with_suffix(".rig.png"), 130)
     if options.json is not None:
         values = figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None}
         write_json(options.json, values)
@@ -283,20 +283,6 @@ def rig_figure(result: RigCalibration) -> Figure:
     figure.legend(handles=shown, loc="outside lower center", ncols=4, fontsize=8)
     figure.suptitle("The rig as calibrated")
     return figure
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG.
-
-    Raises
-    ------
-    UserError
-        If it cannot be written.
-    """
-    try:
-        figure.savefig(path, dpi=130)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _outline(result: RigCalibration, view: int) -> Array:

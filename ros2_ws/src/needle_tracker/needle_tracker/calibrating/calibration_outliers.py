@@ -155,10 +155,10 @@ def square_error(result: RigCalibration) -> tuple[float, float]:
     whitened = fitted.residuals / sigma_px
     roots = np.sqrt(outlier_weights(whitened)) / sigma_px
     others = model.jacobian(fitted.parameters, fitted.free) * roots[:, None]
-    held = given_rows(model, fitted.free)
+    prior_rows = given_rows(model, fitted.free)
     lengths = np.maximum(np.linalg.norm(others, axis=0), 1e-12)
-    matrix = np.concatenate([others, held]) / lengths
-    target = np.concatenate([by_size * roots, np.zeros(len(held))])
+    matrix = np.concatenate([others, prior_rows]) / lengths
+    target = np.concatenate([by_size * roots, np.zeros(len(prior_rows))])
     alone = (target - matrix @ np.linalg.lstsq(matrix, target, rcond=1e-13)[0])[: len(roots)]
     information = float(alone @ alone)
     if information <= _LEAST_SHARE * float(target @ target):

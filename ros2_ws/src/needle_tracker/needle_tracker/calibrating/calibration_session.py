@@ -297,7 +297,7 @@ def views_in_folders(
     sizes: Sizes = {}
     pairs = open_pairs(left, right).refuse_unpaired()
     for pair in progress(pairs, "finding the board"):
-        seen = []
+        corners = []
         for side, path, image in zip(SIDES, pair.files, (pair.left, pair.right), strict=True):
             if image is None:
                 raise UserError(f"cannot read {path}: not an image in 8 bit")
@@ -308,9 +308,9 @@ def views_in_folders(
                     f"are {sizes[side][0]}x{sizes[side][1]}"
                 )
             numbers, pixels = session.board.find(image)
-            seen.append(Corners(session.board.corners[numbers], pixels))
+            corners.append(Corners(session.board.corners[numbers], pixels))
         names = [Path(path).stem for path in (pair.name, *pair.files)]
-        views.append(BoardView(names[0], session.place_of(*names), *seen))
+        views.append(BoardView(names[0], session.place_of(*names), *corners))
     if all(no_board_detected(view) for view in views):
         raise _no_board(session)
     used = [view.place for view in views]
@@ -337,7 +337,7 @@ def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) ->
     pairs : list of dict of str to ndarray
         Left and right images.
     """
-    seen = []
+    corners = []
     for side in SIDES:
         found: dict[int, list[Array]] = {}
         for images in pairs:
@@ -346,8 +346,8 @@ def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) ->
         # A corner that is missing in many exposures is unreliable.
         kept = sorted(n for n, pixels in found.items() if 2 * len(pixels) > len(pairs))
         pixels = np.array([np.mean(found[n], axis=0) for n in kept]).reshape(-1, 2)
-        seen.append(Corners(session.board.corners[kept], pixels))
-    view = BoardView(name, session.place_of(name), seen[0], seen[1])
+        corners.append(Corners(session.board.corners[kept], pixels))
+    view = BoardView(name, session.place_of(name), *corners)
     if no_board_detected(view):
         raise _no_board(session)
     return view

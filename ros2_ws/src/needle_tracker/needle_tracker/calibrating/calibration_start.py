@@ -64,10 +64,10 @@ def checked_views(
     """
     checked = [checked_view(v, alone=surface is None and v.place is None) for v in views]
     for side in SIDES:
-        held = [v for v in checked if v.place is None and len(v.corners(side).points)]
-        if len(held) < least_free:
+        free = [v for v in checked if v.place is None and len(v.corners(side).points)]
+        if len(free) < least_free:
             raise UserError(
-                f"{len(held)} views of the board held freely in air"
+                f"{len(free)} views of the board held freely in air"
                 f"{'' if surface else f' that the {side} camera sees'}, at least "
                 f"{least_free} are needed (20 are good)"
             )
@@ -132,8 +132,8 @@ def calibrate_lenses(
     """
     cameras = []
     for side, window in zip(SIDES, windows, strict=True):
-        seen = [view.corners(side) for view in views if not view.under_surface]
-        lens = _lens([corners for corners in seen if len(corners.points)], side, sizes[side])
+        in_air = [view.corners(side) for view in views if not view.under_surface]
+        lens = _lens([corners for corners in in_air if len(corners.points)], side, sizes[side])
         cameras.append(Camera(*sizes[side], *lens, np.eye(4), window))
     return StereoCalibration(*cameras)
 
@@ -286,7 +286,9 @@ def consistent_views(
         Too many inconsistent views, or the others cannot determine the rig.
     """
     names, pose = _apart(views, _posed(cameras, np.eye(4)))
-    kept, apart = ([v for v in views if (v.name in names) is wanted] for wanted in (False, True))
+    kept, apart = (
+        [v for v in views if (v.name in names) is is_apart] for is_apart in (False, True)
+    )
     try:
         if len(apart) > _MANY * len(views):
             raise UserError(f"{len(apart)} of {len(views)} views")

@@ -64,11 +64,11 @@ class CharucoBoard:
         number = getattr(cv2.aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(number, int):
             raise UserError(f"board.dictionary = {self.dictionary!r} is not one of OpenCV's")
-        wanted = self.columns * self.rows // 2
+        needed = self.columns * self.rows // 2
         markers = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
-        if markers < wanted:
+        if markers < needed:
             raise UserError(
-                f"board of {self.columns} x {self.rows} squares needs {wanted} markers, "
+                f"board of {self.columns} x {self.rows} squares needs {needed} markers, "
                 f"{self.dictionary} has {markers}"
             )
 
@@ -177,7 +177,18 @@ def write_board(board: CharucoBoard, path: Path) -> None:
         ha="center",
         fontsize=6,
     )
+    save_figure(figure, path, _PRINT_DPI)
+
+
+def save_figure(figure: Figure, path: Path, dpi: int) -> None:
+    """Write a figure as PNG or PDF.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
     try:
-        figure.savefig(path, dpi=_PRINT_DPI)
+        figure.savefig(path, dpi=dpi)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error

@@ -95,19 +95,17 @@ class RigCalibration:
     tip_error_p95: float
     apart: list[BoardView]
 
-    def reprojection_rms_px(self, side: str, views: npt.ArrayLike | None = None) -> float:
-        """Return the reprojection error of a camera, over all views or some [px].
+    def reprojection_rms_px(self, side: str, views: npt.ArrayLike) -> float:
+        """Return the reprojection error of a camera over some views [px].
 
         Parameters
         ----------
         side : str
             "left" or "right".
-        views : int or array_like of int, optional
+        views : int or array_like of int
             Numbers of the views.
         """
-        errors = self.residuals(side)
-        if views is not None:
-            errors = errors[np.isin(self.model.view_of[side], views)]
+        errors = self.residuals(side)[np.isin(self.model.view_of[side], views)]
         return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else np.nan
 
     def residuals(self, side: str) -> Array:
@@ -149,10 +147,10 @@ def calibrate(
     least_free = LEAST_FREE_VIEWS if lenses is None else 0
     views = checked_views(views, common_surface(*windows), least_free)
     cameras = lenses or calibrate_lenses(views, sizes, windows)
-    views, apart, seen = consistent_views(views, cameras, least_free)
+    views, apart, relative_pose = consistent_views(views, cameras, least_free)
     tied = are_posed(cameras)
-    if tied and seen is not None:
-        _check_relative_pose(cameras.right.T_optical_rig, seen)
+    if tied and relative_pose is not None:
+        _check_relative_pose(cameras.right.T_optical_rig, relative_pose)
     start, boards = first_calibration(views, cameras)
     model = RigModel(start, views, boards, tied=tied)
     names = list(model.names)
@@ -201,11 +199,11 @@ def calibrate(
     return RigCalibration(calibration, result, model, determined, tip_error, apart)
 
 
-def _check_relative_pose(given: Array, seen: Array) -> None:
+def _check_relative_pose(given: Array, found: Array) -> None:
     """Reject a given relative pose that contradicts the views."""
-    lengths = np.linalg.norm([given[:3, 3], seen[:3, 3]], axis=-1)
-    turn = np.abs(given[:3, :3] - seen[:3, :3]).max()
-    aside = np.abs(given[:3, 3] / lengths[0] - seen[:3, 3] / lengths[1]).max()
+    lengths = np.linalg.norm([given[:3, 3], found[:3, 3]], axis=-1)
+    turn = np.abs(given[:3, :3] - found[:3, :3]).max()
+    aside = np.abs(given[:3, 3] / lengths[0] - found[:3, 3] / lengths[1]).max()
     alike = max(turn, aside) < _LARGEST_TURN
     if not (alike and 0.9 < lengths[0] / lengths[1] < 1.1):
         raise UserError(

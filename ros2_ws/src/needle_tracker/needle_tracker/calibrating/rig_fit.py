@@ -159,17 +159,17 @@ def misfit_px(model: RigModel, result: RigFit) -> float:
         Result of the fit.
     """
     total, spare = 0.0, 0
-    for seen in (view.corners(side) for view in model.views for side in SIDES):
-        if not len(seen.points):
+    for corners in (view.corners(side) for view in model.views for side in SIDES):
+        if not len(corners.points):
             continue
-        degree = 4 if len(seen.points) >= 40 else 2
-        flat = seen.points[:, :2] - seen.points[:, :2].mean(axis=0)
+        degree = 4 if len(corners.points) >= 40 else 2
+        flat = corners.points[:, :2] - corners.points[:, :2].mean(axis=0)
         x, y = (flat / np.abs(flat).max()).T
         terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
         basis = np.stack(terms, axis=-1)
-        rest = seen.pixels - basis @ np.linalg.lstsq(basis, seen.pixels, rcond=None)[0]
+        rest = corners.pixels - basis @ np.linalg.lstsq(basis, corners.pixels, rcond=None)[0]
         total += float(np.sum(rest**2))
-        spare += 2 * max(len(seen.points) - basis.shape[1], 0)
+        spare += 2 * max(len(corners.points) - basis.shape[1], 0)
     noise = total / spare if spare else 0.0
     return float(np.sqrt(max(np.mean(result.residuals**2) - noise, 0.0)))
 
@@ -230,9 +230,9 @@ def _solve(normal: Array, gradient: Array, damping: float) -> Array:
 def _priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
     """Return the indices of the parameters with priors, and the standard deviations."""
     rows, sigmas = _place_priors(model, free)
-    held = np.array([WINDOW.get(name.split(".")[-1], 0.0) for name in model.names])
-    window_rows = np.flatnonzero((held > 0.0) & free[: model.shared])
-    return np.append(window_rows, rows), np.append(held[window_rows], sigmas)
+    window_sigmas = np.array([WINDOW.get(name.split(".")[-1], 0.0) for name in model.names])
+    window_rows = np.flatnonzero((window_sigmas > 0.0) & free[: model.shared])
+    return np.append(window_rows, rows), np.append(window_sigmas[window_rows], sigmas)
 
 
 def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:

@@ -109,8 +109,8 @@ class RigModel:
         self.names += own if self._surface is None else SURFACE
         self.shared = len(self.names)
         self._boards = np.asarray(boards, dtype=np.float64).reshape(-1, 4, 4)
-        self._points = {s: _join([v.corners(s).points for v in views], 3) for s in SIDES}
-        self.pixels = {s: _join([v.corners(s).pixels for v in views], 2) for s in SIDES}
+        self._points = {s: np.concatenate([v.corners(s).points for v in views]) for s in SIDES}
+        self.pixels = {s: np.concatenate([v.corners(s).pixels for v in views]) for s in SIDES}
         self.view_of = {
             s: np.repeat(np.arange(len(views)), [len(v.corners(s).points) for v in views])
             for s in SIDES
@@ -144,8 +144,8 @@ class RigModel:
 
     def residuals(self, parameters: Array) -> Array:
         """Return measured minus expected pixels, left then right, shape (2 * corners,) [px]."""
-        seen = [(self.pixels[s] - self.project(parameters, s)).ravel() for s in SIDES]
-        return np.concatenate(seen)
+        sides = [(self.pixels[s] - self.project(parameters, s)).ravel() for s in SIDES]
+        return np.concatenate(sides)
 
     def project(self, parameters: Array, side: str) -> Array:
         """Return the expected pixels of the corners of one camera, shape (n, 2) [px]."""
@@ -153,10 +153,10 @@ class RigModel:
         boards, transform = self.board_poses(parameters)[self.view_of[side]], camera.T_optical_rig
         corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side])
         corners += boards[:, :3, 3]
-        seen = corners @ transform[:3, :3].T + transform[:3, 3]
+        optical = corners @ transform[:3, :3].T + transform[:3, 3]
         if np.any(under):
-            seen[under] = RefractedCamera(camera).seen_through(corners[under])
-        return project_optical(camera, seen)
+            optical[under] = RefractedCamera(camera).apparent_points(corners[under])
+        return project_optical(camera, optical)
 
     def jacobian(self, parameters: Array, free: Mask) -> Array:
         """Return d(residuals)/d(free parameters), shape (2 * corners, free).
@@ -222,10 +222,6 @@ class RigModel:
         return dataclasses.replace(
             window, point=window.point + offset * window.normal, normal=turned
         )
-
-
-def _join(arrays: list[Array], width: int) -> Array:
-    return np.concatenate([np.zeros((0, width)), *arrays])
 
 
 def needle_points(calibration: StereoCalibration) -> Array:

@@ -91,7 +91,7 @@ def fit_end(
     point: Array,
     direction: Array,
     *,
-    behind: float,
+    shaft_length: float,
     along: float,
     across: float,
     width: float,
@@ -104,8 +104,8 @@ def fit_end(
         Maps of a window.
     point, direction : ndarray, shape (2,)
         Expected end in the window [px], and unit vector along the shaft towards it.
-    behind : float
-        Length of shaft behind the end [px].
+    shaft_length : float
+        Length of visible shaft up to the end [px].
     along, across : float
         Largest distance of the end from the point, along and across the direction [px].
     width : float
@@ -116,7 +116,7 @@ def fit_end(
     ImageEnd or None
         None if the maps show no shaft there.
     """
-    back = min(behind, FIT.line_widths * width)
+    back = min(shaft_length, FIT.line_widths * width)
     if back < FIT.least_line_widths * width:
         return None
     point = np.ascontiguousarray(point, np.float64)
@@ -213,7 +213,7 @@ def _fit_line(
     the mean probability along the line.
     """
     count = int(back)
-    places, middles, weights = np.empty(count), np.empty(count), np.empty(count)
+    positions, middles, weights = np.empty(count), np.empty(count), np.empty(count)
     certainty = breadth = 0.0
     for i in range(count):
         s = end - i
@@ -226,7 +226,7 @@ def _fit_line(
             moment += value * t
             second += value * t * t
             t += 0.5
-        places[i], weights[i] = s, min(0.5 * mass / width, 1.0)
+        positions[i], weights[i] = s, min(0.5 * mass / width, 1.0)
         middles[i] = centre
         if mass > 0.0:
             middles[i] += moment / mass
@@ -236,11 +236,11 @@ def _fit_line(
     certainty /= count
     if total < 2.0:
         return total, offset, slope, 0.0, 0.0, certainty
-    mean = (weights * places).sum() / total
+    mean = (weights * positions).sum() / total
     middle = (weights * middles).sum() / total
-    spread = (weights * (places - mean) ** 2).sum() / total
-    lean = (weights * (places - mean) * (middles - middle)).sum() / (total * spread)
-    residuals = middles - middle - lean * (places - mean)
+    spread = (weights * (positions - mean) ** 2).sum() / total
+    lean = (weights * (positions - mean) * (middles - middle)).sum() / (total * spread)
+    residuals = middles - middle - lean * (positions - mean)
     variance = (weights * residuals * residuals).sum() / total
     # Disturbances of the centre are correlated over about the width of the needle.
     independent = max(total / width - 2.0, 1.0)
@@ -316,7 +316,7 @@ def _quantile(density: Array, level: float) -> float:
     for i in range(len(density)):
         # A sample covers the pixel around it.
         if level <= below + density[i]:
-            place: float = i - 0.5 + (level - below) / density[i]
-            return place
+            position: float = i - 0.5 + (level - below) / density[i]
+            return position
         below += density[i]
     return len(density) - 0.5

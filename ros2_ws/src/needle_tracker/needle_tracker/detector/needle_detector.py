@@ -146,10 +146,10 @@ class NeedleDetector:
 
     def _sampled(self, cells: NDArray[np.bool_], shrink: int) -> tuple[Map, Map]:
         """Return the maps at given cells of the first rows of the grid, 0 at all others."""
-        places = _shrunk_px(self._grid.pixels[: len(cells)], np.float32(shrink))
+        pixels = _shrunk_px(self._grid.pixels[: len(cells)], np.float32(shrink))
         height, width = self._at(shrink).shape
         shaft, ends = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
-        for box in _strips(places[cells]):
+        for box in _strips(pixels[cells]):
             seen_shaft, seen_ends, (x0, y0) = self._evidence(shrink, box)
             rows, columns = seen_shaft.shape
             shaft[y0 : y0 + rows, x0 : x0 + columns] = seen_shaft
@@ -158,7 +158,7 @@ class NeedleDetector:
         # The pitch of the cells may exceed the width of a thin needle.
         shaft = cv2.dilate(shaft, np.ones((3, 3), np.uint8))
         sampled = [
-            np.where(cells, cv2.remap(each, places[..., 0], places[..., 1], cv2.INTER_LINEAR), 0.0)
+            np.where(cells, cv2.remap(each, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR), 0.0)
             for each in (shaft, ends)
         ]
         return sampled[0], sampled[1]
@@ -188,17 +188,17 @@ class NeedleDetector:
         )
         found = []
         for row, column in np.argwhere(peaks):
-            place = np.array([column, row], np.float64)
-            off = _full_px(place + corner, shrink) - path.end
+            pixel = np.array([column, row], np.float64)
+            off = _full_px(pixel + corner, shrink) - path.end
             if math.hypot(*off) > half:
                 continue
-            end = self._fitted((shaft, ends, corner), place, path.direction, width, 0.5 * width)
+            end = self._fitted((shaft, ends, corner), pixel, path.direction, width, 0.5 * width)
             if end is not None:
                 found.append(end)
         if hidden and not found:
             # The end is hidden, but the shaft determines its lateral position.
-            place = _shrunk_px(path.end, shrink) - corner
-            end = self._fitted((shaft, ends, corner), place, path.direction, half, 0.5 * width)
+            pixel = _shrunk_px(path.end, shrink) - corner
+            end = self._fitted((shaft, ends, corner), pixel, path.direction, half, 0.5 * width)
             found = [] if end is None else [end]
         return found
 
@@ -225,13 +225,13 @@ class NeedleDetector:
         if box is None:
             return None
         maps = self._evidence(shrink, box)
-        place = _shrunk_px(point, shrink) - maps[2]
-        return self._fitted(maps, place, direction, along, across)
+        pixel = _shrunk_px(point, shrink) - maps[2]
+        return self._fitted(maps, pixel, direction, along, across)
 
     def _fitted(
         self,
         maps: tuple[Map, Map, tuple[int, int]],
-        place: Array,
+        pixel: Array,
         direction: Array,
         along: float,
         across: float,
@@ -239,13 +239,13 @@ class NeedleDetector:
         """Fit line and end near a pixel of the maps; the result is in pixels of the image."""
         shaft, ends, corner = maps
         shrink, width = self._shrink, self.width_px
-        point = _full_px(place + corner, shrink)
+        point = _full_px(pixel + corner, shrink)
         found = fit_end(
             shaft,
             ends,
-            place,
+            pixel,
             direction,
-            behind=(math.dist(point, self._entry) - self._clear_px) / shrink,
+            shaft_length=(math.dist(point, self._entry) - self._clear_px) / shrink,
             along=along / shrink,
             across=across / shrink,
             width=width / shrink,
@@ -291,18 +291,18 @@ class NeedleDetector:
         return shaft, ends, (x0, y0)
 
 
-def _strips(places: Map) -> list[tuple[int, ...]]:
+def _strips(pixels: Map) -> list[tuple[int, ...]]:
     """Return boxes that cover pixels, shape (n, 2).
 
     The boxes divide the longer side into strips, each only as wide as its pixels, since the reach
     of a needle is a cone.
     """
-    low, high = places.min(axis=0), places.max(axis=0)
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
     axis = int((high - low).argmax())
     edges = np.linspace(low[axis], high[axis], DETECTOR.strips + 1)
     boxes: list[tuple[int, ...]] = []
     for begin, end in itertools.pairwise(edges):
-        inside = places[(places[:, axis] >= begin) & (places[:, axis] <= end)]
+        inside = pixels[(pixels[:, axis] >= begin) & (pixels[:, axis] <= end)]
         if len(inside):
             (x0, y0), (x1, y1) = np.floor(inside.min(axis=0)), np.ceil(inside.max(axis=0)) + 1.0
             boxes.append((int(x0), int(y0), int(x1), int(y1)))

@@ -58,43 +58,44 @@ class NeedleMotion:
         covariance[SCALE, SCALE] = settings.stage_scale_sigma**2
         return NeedleMotion(mean, covariance)
 
-    def advanced(self, way: float, curvature: float) -> NeedleMotion:
+    def advanced(self, displacement: float, curvature: float) -> NeedleMotion:
         """Return the state after a displacement of the needle's base.
 
-        p_{k+1} = p_k + (1 + scale) way h_k,  h_{k+1} = h_k + turn across h_k
+        p_{k+1} = p_k + (1 + scale) d h_k,  h_{k+1} = h_k + turn across h_k
 
         Parameters
         ----------
-        way : float
-            Displacement of the base, negative for a retraction [m].
+        displacement : float
+            Displacement d of the base, negative for a retraction [m].
         curvature : float
             Largest curvature of the path [1/m].
         """
         heading = self.mean[HEADING] / np.linalg.norm(self.mean[HEADING])
         mean, transition = self.mean.copy(), np.eye(SIZE)
-        gone = (1.0 + mean[SCALE]) * way
-        mean[POSITION] += gone * heading
+        travel = (1.0 + mean[SCALE]) * displacement
+        mean[POSITION] += travel * heading
         mean[HEADING] = heading
-        transition[POSITION, HEADING] = gone * np.eye(3)
-        transition[POSITION, SCALE] = way * heading
-        turn = curvature * way
+        transition[POSITION, HEADING] = travel * np.eye(3)
+        transition[POSITION, SCALE] = displacement * heading
+        turn = curvature * displacement
         noise = np.zeros((SIZE, SIZE))
         noise[POSITION, POSITION] = (
-            (FILTER.slip_sigma * way) ** 2 * np.outer(heading, heading)
-            + (0.5 * turn * way) ** 2 * _across(heading)
+            (FILTER.slip_sigma * displacement) ** 2 * np.outer(heading, heading)
+            + (0.5 * turn * displacement) ** 2 * _across(heading)
             + FILTER.drift_sigma**2 * np.eye(3)
         )
         noise[HEADING, HEADING] = turn**2 * _across(heading)
         return NeedleMotion(mean, transition @ self.covariance @ transition.T + noise)
 
-    def spread(self, way_sigma: float) -> Array:
+    def spread(self, displacement_sigma: float) -> Array:
         """Return the tip's covariance after a further, unknown displacement of zero mean [m^2].
 
-        Cov(p + w h) = Cov(p) + sigma_w^2 (h h^T + Cov(h))
+        Cov(p + d h) = Cov(p) + sigma_d^2 (h h^T + Cov(h))
         """
         heading = self.mean[HEADING]
-        ways = np.outer(heading, heading) + self.covariance[HEADING, HEADING]
-        return np.asarray(self.covariance[POSITION, POSITION] + way_sigma**2 * ways)
+        directions = np.outer(heading, heading) + self.covariance[HEADING, HEADING]
+        spread = displacement_sigma**2 * directions
+        return np.asarray(self.covariance[POSITION, POSITION] + spread)
 
     def surprise(self, tip: SpatialTip) -> tuple[float, float]:
         """Return the squared Mahalanobis distance of a sighting, and its log-density."""
@@ -121,15 +122,15 @@ class NeedleMotion:
         covariance = left @ self.covariance @ left.T + (gain * variances) @ gain.T
         return NeedleMotion(mean, covariance)
 
-    def seen(self, tip: SpatialTip) -> NeedleMotion:
+    def corrected_by_tip(self, tip: SpatialTip) -> NeedleMotion:
         """Return the state after a sighting of the tip."""
         values, axes = np.linalg.eigh(tip.covariance)
         rows = np.zeros((3, SIZE))
         rows[:, POSITION] = axes.T
         return self.corrected(rows, axes.T @ (tip.position - self.mean[POSITION]), values)
 
-    def measured(self, length: float, insertion: float, sigma: float) -> NeedleMotion:
-        """Return the state after the length of the shaft was compared with the insertion.
+    def corrected_by_length(self, length: float, insertion: float, sigma: float) -> NeedleMotion:
+        """Return the state after a comparison of the shaft's length with the insertion.
 
         length = (1 + scale) insertion + zero; a tip that is farther ahead makes the shaft longer.
         """
@@ -159,33 +160,40 @@ class NeedleTrack:
     ----------
     motion : NeedleMotion
         State if it is the needle.
-    place, place_covariance : ndarray, shape (3,) and (3, 3)
-        Position if it stands still [m].
-    end_log_odds : float
-        Log-odds that it is an end.
-    place_log_odds : float
-        Log-odds that the needle ends here, from the insertion and the length of the shaft.
+    rest_position, rest_covariance : ndarray, shape (3,) and (3, 3)
+        Position if it stands still [m], and its covariance [m^2].
+    recent_evidence : float
+        Mean log-odds that it is an end, from the sightings of about the last
+        `FilterSettings.evidence_length`.
+    earlier_evidence : float
+        Log-odds that it is an end, from earlier sightings.
+    length_log_odds : float
+        Mean log-odds that the needle ends here, from the insertion and the length of the shaft.
     motion_log_odds : float
         Log-odds that it moves like the needle rather than standing still.
     insertion : float or None
         Insertion of the last pair [m].
-    way : float or None
+    sightings : int
+        Number of sightings.
+    travel : float or None
         Travel of the stage since the last sighting [m]; None if the insertion is unknown.
-    way_sigma : float
+    travel_sigma : float
         Standard deviation of the travel since the previous pair [m]; 0 if the insertion is known.
     misses : int
         Consecutive pairs without a sighting.
     """
 
     motion: NeedleMotion
-    place: Array
-    place_covariance: Array
-    end_log_odds: float
-    place_log_odds: float
+    rest_position: Array
+    rest_covariance: Array
+    recent_evidence: float
+    earlier_evidence: float
+    length_log_odds: float
     motion_log_odds: float
     insertion: float | None
-    way: float | None = 0.0
-    way_sigma: float = 0.0
+    sightings: int = 1
+    travel: float | None = 0.0
+    travel_sigma: float = 0.0
     misses: int = 0
 
     @staticmethod
@@ -196,25 +204,24 @@ class NeedleTrack:
         tip = sighting.tip
         motion = NeedleMotion.begin(tip, settings)
         if insertion is not None and sighting.length is not None:
-            motion = motion.measured(sighting.length, insertion, FILTER.length_sigma)
-        end = FILTER.prior_log_odds + sighting.evidence
-        place = place_log_odds(sighting, insertion, settings)
+            motion = motion.corrected_by_length(sighting.length, insertion, FILTER.length_sigma)
+        length = length_log_odds(sighting.length, insertion, settings)
         return NeedleTrack(
-            motion, tip.position, tip.covariance, end, place, 0.0, insertion
-        )._bounded()
+            motion, tip.position, tip.covariance, sighting.evidence, 0.0, length, 0.0, insertion
+        )
 
     def predicted(self, insertion: float | None, settings: StereoTrackerParameters) -> NeedleTrack:
         """Return the track at the next pair, before any sighting in it."""
-        step, way, way_sigma = 0.0, None, FILTER.free_step * math.sqrt(self.misses + 1.0)
+        step, travel, travel_sigma = 0.0, None, FILTER.free_step * math.sqrt(self.misses + 1.0)
         if insertion is not None and self.insertion is not None:
-            step, way_sigma = insertion - self.insertion, 0.0
-            way = None if self.way is None else self.way + step
+            step, travel_sigma = insertion - self.insertion, 0.0
+            travel = None if self.travel is None else self.travel + step
         return dataclasses.replace(
             self,
             motion=self.motion.advanced(step, settings.max_curvature),
-            way=way,
-            way_sigma=way_sigma,
-            place_covariance=self.place_covariance + FILTER.drift_sigma**2 * np.eye(3),
+            travel=travel,
+            travel_sigma=travel_sigma,
+            rest_covariance=self.rest_covariance + FILTER.drift_sigma**2 * np.eye(3),
             insertion=insertion,
         )
 
@@ -222,72 +229,81 @@ class NeedleTrack:
         """Return the squared Mahalanobis distance of a sighting from this track.
 
         This is the smaller of the distances from the needle, including an unknown travel, and from
-        the place.
+        the position at rest.
         """
         as_needle, _ = self._motion_to(tip, settings).surprise(tip)
-        as_needle += self._ways(tip) ** 2
-        as_other, _ = gaussian(tip.position - self.place, self.place_covariance + tip.covariance)
+        as_needle += self._travel_in_sigmas(tip) ** 2
+        as_other, _ = self._surprise_at_rest(tip)
         return min(as_needle, as_other)
 
     def fits(self, tip: SpatialTip, settings: StereoTrackerParameters) -> bool:
         """Return whether a sighting may belong to this track."""
         return self.surprise(tip, settings) < PAIRING.gate
 
-    def seen(self, sighting: Sighting, settings: StereoTrackerParameters) -> NeedleTrack:
+    def updated(self, sighting: Sighting, settings: StereoTrackerParameters) -> NeedleTrack:
         """Return the predicted track after a sighting that `fits`."""
         tip = sighting.tip
         motion = self._motion_to(tip, settings)
-        _, stood = gaussian(tip.position - self.place, self.place_covariance + tip.covariance)
-        gain = self._log_density(tip, motion, stood) - _log_sum(
-            stood, math.log(FILTER.chance_density)
-        )
-        place, covariance = _merged(self.place, self.place_covariance, tip)
-        way = math.dist(tip.position, self.place) if self.way is None else abs(self.way)
-        independent = min(way / FILTER.evidence_length, 1.0)
+        _, at_rest = self._surprise_at_rest(tip)
+        elsewhere = math.log(FILTER.chance_density)
+        gain = self._log_density(tip, motion, at_rest) - _log_sum(at_rest, elsewhere)
+        rest_position, rest_covariance = _merged(self.rest_position, self.rest_covariance, tip)
+        travel = self.travel
+        if travel is None:
+            travel = math.dist(tip.position, self.rest_position)
+        independent = min(abs(travel) / FILTER.evidence_length, 1.0)
+        # Images of nearly the same needle are repeated readings of one evidence: their mean counts.
+        weight = max(1.0 / (self.sightings + 1), independent)
+        length = self.length_log_odds
+        if sighting.length is not None:
+            length = length_log_odds(sighting.length, self.insertion, settings)
         # The end after a gap may be that of another object, such as the shadow of the needle.
         before = self.motion_log_odds
         before = max(before - FILTER.miss_cost * self.misses, min(before, 0.0))
         return dataclasses.replace(
             self,
-            motion=motion.seen(tip),
-            place=place,
-            place_covariance=covariance,
-            end_log_odds=self.end_log_odds + independent * sighting.evidence,
-            # An object that ended where the needle cannot end is not the needle.
-            place_log_odds=min(
-                self.place_log_odds, place_log_odds(sighting, self.insertion, settings)
-            ),
-            motion_log_odds=before + gain,
-            way=0.0,
+            motion=motion.corrected_by_tip(tip),
+            rest_position=rest_position,
+            rest_covariance=rest_covariance,
+            recent_evidence=(1.0 - weight) * self.recent_evidence + weight * sighting.evidence,
+            earlier_evidence=_bounded(self.earlier_evidence + independent * self.recent_evidence),
+            length_log_odds=(1.0 - weight) * self.length_log_odds + weight * length,
+            motion_log_odds=_bounded(before + gain),
+            sightings=self.sightings + 1,
+            travel=0.0,
             misses=0,
-        )._bounded()
+        )
+
+    def _surprise_at_rest(self, tip: SpatialTip) -> tuple[float, float]:
+        """Return squared distance and log-density of a sighting if this stands still."""
+        return gaussian(tip.position - self.rest_position, self.rest_covariance + tip.covariance)
 
     def _motion_to(self, tip: SpatialTip, settings: StereoTrackerParameters) -> NeedleMotion:
         """Return the state at a sighting; an unknown travel is the distance to the sighting."""
-        if self.way_sigma == 0.0:
+        if self.travel_sigma == 0.0:
             return self.motion
-        way = self._ways(tip) * self.way_sigma
-        return self.motion.advanced(way, settings.max_curvature)
+        travel = self._travel_in_sigmas(tip) * self.travel_sigma
+        return self.motion.advanced(travel, settings.max_curvature)
 
-    def _ways(self, tip: SpatialTip) -> float:
+    def _travel_in_sigmas(self, tip: SpatialTip) -> float:
         """Return the travel to a sighting in standard deviations; 0 if the insertion is known."""
-        if self.way_sigma == 0.0:
+        if self.travel_sigma == 0.0:
             return 0.0
         ahead = tip.position - self.motion.mean[POSITION]
-        return float(ahead @ self.motion.mean[HEADING]) / self.way_sigma
+        return float(ahead @ self.motion.mean[HEADING]) / self.travel_sigma
 
-    def _log_density(self, tip: SpatialTip, motion: NeedleMotion, stood: float) -> float:
+    def _log_density(self, tip: SpatialTip, motion: NeedleMotion, at_rest: float) -> float:
         """Return the log-density of a sighting if this is the needle [1/m^3]."""
         _, moved = motion.surprise(tip)
-        if self.way_sigma == 0.0:
+        if self.travel_sigma == 0.0:
             return moved
         # The travel was fitted to the sighting: along the heading, use the density of the travel.
         heading = motion.mean[HEADING]
         total = motion.covariance[POSITION, POSITION] + tip.covariance
         along = math.sqrt(float(heading @ total @ heading))
-        moved += math.log(along / self.way_sigma) - 0.5 * self._ways(tip) ** 2
+        moved += math.log(along / self.travel_sigma) - 0.5 * self._travel_in_sigmas(tip) ** 2
         # Rest and motion are equally probable.
-        return _log_sum(moved, stood) + math.log(0.5)
+        return _log_sum(moved, at_rest) + math.log(0.5)
 
     def missed(self) -> NeedleTrack:
         """Return the predicted track after a pair without a sighting."""
@@ -301,31 +317,23 @@ class NeedleTrack:
         the insertion is known, a line without an end is fitted where the stage predicts the end, so
         that its motion is no evidence.
 
-        P(else) / P(needle) = (e^-motion + e^-end [e^-motion] + e^-shadow) e^-place
+        P(else) / P(needle) = (e^-motion + e^-end [e^-motion] + e^-shadow) e^-length
         """
-        no_end = -self.end_log_odds
+        evidence = self.recent_evidence + self.earlier_evidence
+        no_end = -_bounded(FILTER.prior_log_odds + evidence)
         if self.insertion is None:
             no_end -= self.motion_log_odds
         others = _log_sum(-self.motion_log_odds, no_end)
-        return self.place_log_odds - _log_sum(others, -FILTER.shadow_log_odds)
+        return self.length_log_odds - _log_sum(others, -FILTER.shadow_log_odds)
 
     def rank(self) -> float:
         """Return the log-odds for comparison with other tracks, reduced by each miss."""
         return self.log_odds() - FILTER.miss_cost * self.misses
 
-    def _bounded(self) -> NeedleTrack:
-        """Return the track with bounded log-odds."""
-        bound = FILTER.max_log_odds
-        return dataclasses.replace(
-            self,
-            end_log_odds=min(max(self.end_log_odds, -bound), bound),
-            motion_log_odds=min(max(self.motion_log_odds, -bound), bound),
-        )
-
     @property
     def tip(self) -> tuple[Array, Array]:
-        """Tip [m] and its covariance [m^2], including an unknown way."""
-        return self.motion.mean[POSITION], self.motion.spread(self.way_sigma)
+        """Tip [m] and its covariance [m^2], including an unknown travel."""
+        return self.motion.mean[POSITION], self.motion.spread(self.travel_sigma)
 
     @property
     def stage(self) -> tuple[float, float]:
@@ -333,36 +341,38 @@ class NeedleTrack:
         return float(self.motion.mean[ZERO]), float(self.motion.mean[SCALE])
 
 
-def place_log_odds(
-    sighting: Sighting, insertion: float | None, settings: StereoTrackerParameters
+def length_log_odds(
+    length: float | None, insertion: float | None, settings: StereoTrackerParameters
 ) -> float:
-    """Return the log-odds that the end at a place is that of the needle.
+    """Return the log-odds that an end is that of the needle, from the length of its shaft [m].
 
-    The needle is as long as the insertion, while other objects end at any distance. An end that was
-    found by following the stage is no further evidence: infinite. Without the insertion, all places
-    are equally likely.
+    The needle is as long as the insertion, while other objects end at any distance. If one of the
+    two is unknown, all lengths are equally likely.
     """
-    if insertion is None:
+    if insertion is None or length is None:
         return 0.0
-    if sighting.length is None:
-        return math.inf
     sigma = math.hypot(
         settings.stage_zero_sigma,
         settings.stage_scale_sigma * insertion,
         FILTER.length_sigma,
     )
-    off = (sighting.length - insertion) / sigma
-    return math.log(settings.max_insertion / (math.sqrt(2.0 * math.pi) * sigma)) - 0.5 * off * off
+    off = (length - insertion) / sigma
+    agreeing = math.log(settings.max_insertion / (math.sqrt(2.0 * math.pi) * sigma))
+    return _bounded(agreeing - 0.5 * off * off)
 
 
-def _merged(place: Array, covariance: Array, tip: SpatialTip) -> tuple[Array, Array]:
+def _merged(position: Array, covariance: Array, tip: SpatialTip) -> tuple[Array, Array]:
     """Return the covariance-weighted mean; a distant new position replaces the old one."""
     total = covariance + tip.covariance
-    off = tip.position - place
+    off = tip.position - position
     if float(off @ np.linalg.solve(total, off)) > PAIRING.gate:
         return tip.position, tip.covariance
     gain = np.linalg.solve(total, covariance).T
-    return place + gain @ off, covariance - gain @ covariance
+    return position + gain @ off, covariance - gain @ covariance
+
+
+def _bounded(log_odds: float) -> float:
+    return min(max(log_odds, -FILTER.max_log_odds), FILTER.max_log_odds)
 
 
 def _log_sum(one: float, other: float) -> float:

@@ -216,7 +216,7 @@ class NeedleTracker:
         if best is not None and self._believed:
             sighting = self._follow(best)
         if sighting is not None and best is not None:
-            predicted, followed = self._tracks, best.seen(sighting, settings)
+            predicted, followed = self._tracks, best.updated(sighting, settings)
             self._tracks = [followed if t is best else t.missed() for t in predicted]
             if self._probability(followed) > FILTER.accepted:
                 return self._answer(sighting, "")
@@ -260,7 +260,7 @@ class NeedleTracker:
                 tracks.append((track.missed(), None))
             else:
                 left.remove(own)
-                tracks.append((track.seen(own, settings), own))
+                tracks.append((track.updated(own, settings), own))
         tracks += [(NeedleTrack.begin(each, insertion, settings), each) for each in left]
         kept = [pair for pair in tracks if pair[0].misses < FILTER.forgotten_after]
         kept.sort(key=lambda pair: -pair[0].rank())

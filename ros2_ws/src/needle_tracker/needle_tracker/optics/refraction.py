@@ -126,7 +126,7 @@ def _crossing(camera: Array, distance: float, depth: float) -> float:
 
 
 @inlined
-def _seen(
+def _apparent_point(
     camera: Array, point_x: float, point_y: float, point_z: float
 ) -> tuple[float, float, float]:
     """Return the point of the outer face at which a point appears, in the optical frame [m]."""
@@ -149,7 +149,7 @@ def _seen(
 
 
 @compiled
-def apparent_points(camera: Array, points: Array, seen: Array) -> None:
+def apparent_points(camera: Array, points: Array, apparent: Array) -> None:
     """Write the points of the outer face at which points appear.
 
     Parameters
@@ -158,11 +158,13 @@ def apparent_points(camera: Array, points: Array, seen: Array) -> None:
         Packed camera, from `pack_camera`.
     points : ndarray, shape (n, 3)
         Points in `rig` [m]; those in front of the window are not refracted.
-    seen : ndarray, shape (n, 3)
+    apparent : ndarray, shape (n, 3)
         Output: points in the optical frame [m].
     """
     for i in range(len(points)):
-        seen[i, 0], seen[i, 1], seen[i, 2] = _seen(camera, points[i, 0], points[i, 1], points[i, 2])
+        apparent[i, 0], apparent[i, 1], apparent[i, 2] = _apparent_point(
+            camera, points[i, 0], points[i, 1], points[i, 2]
+        )
 
 
 @compiled
@@ -178,7 +180,7 @@ def project_point(camera: Array, point: Array, pixel: Array) -> None:
     pixel : ndarray, shape (2,)
         Output: pixel coordinates; NaN behind the camera.
     """
-    x, y, z = _seen(camera, point[0], point[1], point[2])
+    x, y, z = _apparent_point(camera, point[0], point[1], point[2])
     if z <= 0.0:
         pixel[0] = pixel[1] = np.nan
         return
@@ -219,15 +221,15 @@ def pixel_ray(camera: Array, pixel: Array, origin: Array, direction: Array) -> N
         body; NaN if the pixel does not see the window or the distortion has no inverse.
     """
     k1, k2, p1, p2, k3 = camera[19], camera[20], camera[21], camera[22], camera[23]
-    seen_x = (pixel[0] - camera[17]) / camera[15]
-    seen_y = (pixel[1] - camera[18]) / camera[16]
-    x, y = seen_x, seen_y
+    distorted_x = (pixel[0] - camera[17]) / camera[15]
+    distorted_y = (pixel[1] - camera[18]) / camera[16]
+    x, y = distorted_x, distorted_y
     miss_x = miss_y = 0.0
     for _ in range(_UNDISTORT_ITERATIONS):
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        miss_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - seen_x
-        miss_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - seen_y
+        miss_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - distorted_x
+        miss_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - distorted_y
         if abs(miss_x) + abs(miss_y) < 1e-15:
             break
         slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
@@ -354,9 +356,9 @@ class RefractedCamera:
         ndarray, shape (..., 2)
             Pixel coordinates, also outside the image; NaN behind the camera.
         """
-        return project_optical(self.camera, self.seen_through(points))
+        return project_optical(self.camera, self.apparent_points(points))
 
-    def seen_through(self, points: Array) -> Array:
+    def apparent_points(self, points: Array) -> Array:
         """Return the points of the outer face at which points appear, in the optical frame.
 
         Parameters
@@ -370,9 +372,9 @@ class RefractedCamera:
             Points in the optical frame [m].
         """
         points = np.ascontiguousarray(points, dtype=np.float64)
-        seen = np.empty(points.shape)
-        apparent_points(self.packed, points.reshape(-1, 3), seen.reshape(-1, 3))
-        return seen
+        apparent = np.empty(points.shape)
+        apparent_points(self.packed, points.reshape(-1, 3), apparent.reshape(-1, 3))
+        return apparent
 
     def jacobian(self, point: Array) -> Array:
         """Return d(pixel)/d(point) [px/m], shape (2, 3), at one point in `rig` [m]."""

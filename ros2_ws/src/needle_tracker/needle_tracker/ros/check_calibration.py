@@ -108,8 +108,8 @@ def check_calibration(options: Namespace, words: list[str]) -> int:
     calibration, session = load_calibration(options.calibration), load_session(options.session)
     if options.left is not None and options.right is not None:
         views, sizes = views_in_folders(options.left, options.right, session, all_places=False)
-        for side, wanted in calibration.sizes.items():
-            if problem := size_problem(side, sizes[side], wanted):
+        for side, expected in calibration.sizes.items():
+            if problem := size_problem(side, sizes[side], expected):
                 raise UserError(problem)
         if free := [view.name for view in views if view.place is None]:
             print(f"held freely in air, as the session has no such place: {', '.join(free)}")

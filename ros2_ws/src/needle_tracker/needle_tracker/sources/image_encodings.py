@@ -29,7 +29,7 @@ _BAYER = {
 }
 ENCODINGS = (*_GREY, *_COLOUR, *_YUV, *_BAYER)
 """Supported encodings."""
-WANTED = "8 bits, such as mono8 or bgr8"
+SUPPORTED = "8 bits, such as mono8 or bgr8"
 """Supported encodings, in short."""
 
 

@@ -64,22 +64,24 @@ class NamedPair:
 
     def problem(self, sizes: Sizes) -> str:
         """Return the problem with an image, such as another size; empty if both are usable."""
-        for (side, wanted), image in zip(sizes.items(), (self.left, self.right), strict=True):
+        for (side, expected), image in zip(sizes.items(), (self.left, self.right), strict=True):
             if image is None:
                 return f"{side} image is unreadable or not of 8 bit"
-            if problem := size_problem(side, image.shape[::-1], wanted):
+            if problem := size_problem(side, image.shape[::-1], expected):
                 return problem
         return ""
 
 
-def size_problem(side: str, size: tuple[int, ...], wanted: tuple[int, int]) -> str:
+def size_problem(side: str, size: tuple[int, ...], expected: tuple[int, int]) -> str:
     """Return a message if the size of an image differs from the calibration, else an empty text.
 
     Sizes are width and height [px].
     """
-    if size == wanted:
+    if size == expected:
         return ""
-    return f"{side} image is {size[0]}x{size[1]}, the calibration is for {wanted[0]}x{wanted[1]}"
+    return (
+        f"{side} image is {size[0]}x{size[1]}, the calibration is for {expected[0]}x{expected[1]}"
+    )
 
 
 @dataclasses.dataclass

@@ -143,8 +143,8 @@ class CameraPair:
                 raise UserError(f"the cameras gave no pair {LOST_AFTER} times in a row: unplugged?")
             return None
         self._failed = 0
-        for (side, wanted), image in zip(self._sizes.items(), (left, right), strict=True):
-            if problem := size_problem(side, image.shape[::-1], wanted):
+        for (side, expected), image in zip(self._sizes.items(), (left, right), strict=True):
+            if problem := size_problem(side, image.shape[::-1], expected):
                 raise UserError(problem)
         return StampedPair(left, right, stamps["left"], stamps["right"])
 

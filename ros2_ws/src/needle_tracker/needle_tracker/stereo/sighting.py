@@ -138,9 +138,9 @@ class StereoSearch:
             self._sighting((one[0], other[0]), (one[1], other[1]), least, most)
             for one, other in itertools.product(_distinct(left), _distinct(right))
         ]
-        seen = sorted(filter(None, sightings), key=lambda sighting: -sighting.evidence)
-        if seen:
-            return seen, seen[0].ends
+        sorted_sightings = sorted(filter(None, sightings), key=lambda sighting: -sighting.evidence)
+        if sorted_sightings:
+            return sorted_sightings, sorted_sightings[0].ends
         alone = (
             [end for path in own[:1] for end in detector.ends_near(path, hidden=True)]
             for detector, own in zip(self.detectors, found, strict=True)
@@ -363,7 +363,7 @@ def _bends(s: Array) -> Array:
 
 def _smooth(pixels: Array) -> Array:
     """Smooth the steps of the cells out of a path: a moving average, shorter at the ends."""
-    place = np.arange(len(pixels))
-    half = np.minimum(SEARCH.smooth_rows // 2, np.minimum(place, place[::-1]))
+    row = np.arange(len(pixels))
+    half = np.minimum(SEARCH.smooth_rows // 2, np.minimum(row, row[::-1]))
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(pixels, axis=0)])
-    return np.asarray((sums[place + half + 1] - sums[place - half]) / (2 * half + 1)[:, None])
+    return np.asarray((sums[row + half + 1] - sums[row - half]) / (2 * half + 1)[:, None])

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from drawn_needles import arc
 from needle_tracker.answers.annotation import annotate, describe, describe_view, missing
 from needle_tracker.answers.run_summary import DetectionCounts
 from needle_tracker.answers.track_images import COLUMNS, to_row
@@ -30,10 +30,9 @@ def test_tip_and_state_are_drawn_at_their_pixels(
     calibration: StereoCalibration,
     settings: StereoTrackerParameters,
     draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
-    make_arc: Callable[..., np.ndarray],
 ) -> None:
     tracker = NeedleTracker(calibration, settings)
-    left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
+    left, right = draw_pair(arc(0.05, 5.0, 1.0))
     for _ in range(2):
         measured = tracker.process(left, right, 0.05)
     picture = annotate(left, right, measured)
@@ -140,4 +139,3 @@ def test_rotations_of_the_covariance_spread_the_direction() -> None:
         turns = rng.multivariate_normal(np.zeros(3), small, 4000, method="eigh")
         moved = Rotation.from_rotvec(turns).apply(d) - d
         np.testing.assert_allclose(np.cov(moved.T), wanted, atol=0.12 * np.abs(wanted).max())
-    assert math.isfinite(ROLL_VARIANCE)

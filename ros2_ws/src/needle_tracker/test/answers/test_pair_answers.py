@@ -76,14 +76,6 @@ def test_an_answer_is_sent_before_the_check_for_swapped_images(
     assert done == ["published", "suspected"] * 2
 
 
-def test_a_pair_waits_for_the_joint_state_that_follows_it(answering: Answering) -> None:
-    answering.joint(10)
-    answering.pair(15)
-    assert not answering.given
-    answering.joint(20)
-    assert answering.given == {15: 0.015}
-
-
 @pytest.mark.parametrize(
     ("arrivals", "answered"),
     [

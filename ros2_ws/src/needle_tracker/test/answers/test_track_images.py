@@ -176,20 +176,12 @@ def test_unusable_input_is_reported_in_one_line(track: Track, folder: Path, caps
     given = folder / "given.txt"
     for option, text, says in (
         ("--params", NODE % "needle_widht: 0.001", "needle_widht"),
-        ("--params", NODE % "needle_width: 1.0", "needle_width"),
-        ("--params", "stereo_trakcer: {ros__parameters: {needle_width: 0.001}}", "stereo_trakcer"),
-        ("--params", "/left/stereo_tracker: {ros__parameters: {}}", "this node is /stereo_tracker"),
-        ("--params", NODE % "seed: 1, seed: 2", "duplicate key 'seed' in line 1"),
         ("--params", NODE % "reference_folder: /nowhere", "/nowhere"),
         ("--insertion", "name,insertion\na,1\n", "insertion_m"),
         ("--insertion", CSV + "a,far\n", "line 2"),
-        ("--insertion", CSV + "a,nan\n", "line 2"),
         ("--insertion", CSV + "a,0.1\na,0.2\n", "line 3"),
         ("--insertion", "", "name"),
-        ("--truth", "name,x_m,y_m\n", "no column 'z_m'"),
         ("--truth", TRUTH + "a,1,2,\n", "line 2: z_m '' is not a number"),
-        ("--calibration", "", "phantom is missing"),
-        ("--left", None, "does not exist"),
         ("--insertion", None, "No such file"),
         ("--overlay", "", "File exists|is not empty|Not a directory"),
     ):

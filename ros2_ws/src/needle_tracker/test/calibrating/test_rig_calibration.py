@@ -59,9 +59,12 @@ def test_tips_are_accurate_to_60_micrometres_as_reported(
     assert error <= 60e-6
     assert error <= 1.5 * result.tip_error_p95 <= 120e-6
     assert result.fit.corner_sigma_px == pytest.approx(NOISE_PX, rel=0.1)
+    views = np.arange(len(result.model.views))
     for side in SIDES:
         # Two coordinates per corner.
-        assert result.reprojection_rms_px(side) == pytest.approx(math.sqrt(2) * NOISE_PX, rel=0.15)
+        assert result.reprojection_rms_px(side, views) == pytest.approx(
+            math.sqrt(2) * NOISE_PX, rel=0.15
+        )
     error, sigma = square_error(result)
     assert abs(error) < 4.0 * sigma
     assert contradictions(result, (error, sigma)) == []

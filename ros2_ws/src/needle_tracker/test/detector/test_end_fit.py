@@ -33,7 +33,9 @@ def fitted(
     """Fit from a position 3 px and a direction 0.03 rad beside the truth."""
     direction = np.array([math.cos(angle + 0.03), math.sin(angle + 0.03)])
     place = END + np.array([3.0, 0.0])
-    return fit_end(*drawn, place, direction, behind=60.0, along=15.0, across=across, width=WIDTH)
+    return fit_end(
+        *drawn, place, direction, shaft_length=60.0, along=15.0, across=across, width=WIDTH
+    )
 
 
 @pytest.mark.parametrize("angle", [-2.5, -0.4, 0.0, 0.2, 1.3])

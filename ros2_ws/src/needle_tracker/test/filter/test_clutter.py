@@ -81,16 +81,19 @@ def path(calibration_path: Path) -> Path:
     return calibration_path.with_name("calibration_top_and_side.yaml")
 
 
-@pytest.mark.parametrize("name", ["calibration.yaml", "calibration_top_and_side.yaml"])
-def test_simulation_and_tracker_project_alike(calibration_path: Path, name: str) -> None:
-    path = calibration_path.with_name(name)
-    rig = load_stereo_rig(path)
-    # In the gel, in the acrylic, and before it.
-    points = np.random.default_rng(0).uniform([-0.03, -0.03, 0.0], [0.04, 0.05, 0.14], (2000, 3))
-    for camera, view in zip(
-        (rig.left, rig.right), stereo_views(load_calibration(path)), strict=True
-    ):
-        np.testing.assert_allclose(view.project(points), project(points, camera), atol=1e-9)
+def test_simulation_and_tracker_project_alike(calibration_path: Path, tmp_path: Path) -> None:
+    windows = calibration_path.with_name("calibration_top_and_side.yaml").read_text()
+    layered = windows.replace("layers: [", "layers: [{thickness: 0.003, refractive_index: 1.1}, ")
+    # In the gel, in the layers, and before them.
+    points = np.random.default_rng(0).uniform([-0.2, -0.2, -0.2], [0.04, 0.05, 0.3], (2000, 3))
+    path = tmp_path / "rig.yaml"
+    for text in (calibration_path.read_text(), windows, layered):
+        path.write_text(text)
+        rig = load_stereo_rig(path)
+        for camera, view in zip(
+            (rig.left, rig.right), stereo_views(load_calibration(path)), strict=True
+        ):
+            np.testing.assert_allclose(view.project(points), project(points, camera), atol=1e-9)
 
 
 @pytest.mark.parametrize(("scenario", "most"), [("clean", 0.2e-3), ("clutter", 0.3e-3)])

@@ -47,12 +47,12 @@ def test_the_needle_advances_along_its_heading_by_the_motion_of_the_stage(
 def test_the_covariance_after_a_motion_agrees_with_simulated_needles(
     motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
-    rng, way = np.random.default_rng(0), 5e-3
+    rng, travel = np.random.default_rng(0), 5e-3
     starts = rng.multivariate_normal(motion.mean, motion.covariance, 20_000)
     heading = starts[:, HEADING]
-    ends = starts[:, POSITION] + (1.0 + starts[:, [SCALE]]) * way * heading
-    after = motion.advanced(way, 1e-9)
-    slip = (FILTER.slip_sigma * way) ** 2 * np.outer(AHEAD, AHEAD)
+    ends = starts[:, POSITION] + (1.0 + starts[:, [SCALE]]) * travel * heading
+    after = motion.advanced(travel, 1e-9)
+    slip = (FILTER.slip_sigma * travel) ** 2 * np.outer(AHEAD, AHEAD)
     noise = slip + FILTER.drift_sigma**2 * np.eye(3)
     np.testing.assert_allclose(
         after.covariance[POSITION, POSITION], np.cov(ends.T) + noise, atol=5e-9
@@ -94,8 +94,8 @@ def test_an_error_of_the_stage_is_estimated_and_does_not_move_the_tip(
         true = at + (length - (1.0 + scale) * 0.05 - zero) * AHEAD
         if mm:
             motion = motion.advanced(1e-3, settings.max_curvature)
-        motion = motion.seen(sighting(true + rng.normal(0.0, 0.1e-3, 3)))
-        motion = motion.measured(length + rng.normal(0.0, 0.2e-3), insertion, 0.4e-3)
+        motion = motion.corrected_by_tip(sighting(true + rng.normal(0.0, 0.1e-3, 3)))
+        motion = motion.corrected_by_length(length + rng.normal(0.0, 0.2e-3), insertion, 0.4e-3)
     assert np.linalg.norm(motion.mean[POSITION] - true) < 0.15e-3
     total = motion.mean[ZERO] + motion.mean[SCALE] * 0.08
     assert total == pytest.approx(zero + scale * 0.08, abs=0.3e-3)

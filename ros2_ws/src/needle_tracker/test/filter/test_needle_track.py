@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -33,7 +34,7 @@ def after(
     for place, insertion in zip(places[1:], insertions[1:], strict=True):
         track = track.predicted(insertion, settings)
         if track.fits(sighting(place).tip, settings):
-            track = track.seen(sighting(place), settings)
+            track = track.updated(sighting(place), settings)
         else:
             track = track.missed()
     return track
@@ -79,7 +80,8 @@ def test_the_same_picture_again_is_no_further_evidence(
 ) -> None:
     once = after(settings, [0.05], [insertion])
     often = after(settings, [0.05] * 20, [insertion] * 20)
-    assert often.end_log_odds == pytest.approx(once.end_log_odds, abs=0.01)
+    evidence = often.recent_evidence + often.earlier_evidence
+    assert evidence == pytest.approx(once.recent_evidence, abs=0.02)
     assert often.motion_log_odds < 0.1
 
 
@@ -88,5 +90,31 @@ def test_after_a_gap_the_needle_must_move_again(settings: StereoTrackerParameter
     track = before = after(settings, insertions, list(insertions))
     for n in range(20):
         track = track.predicted(insertions[-1] + 1e-3 * n, settings).missed()
-    again = track.seen(sighting(insertions[-1] + 19e-3), settings)
+    again = track.updated(sighting(insertions[-1] + 19e-3), settings)
     assert again.motion_log_odds < before.motion_log_odds
+
+
+@pytest.mark.parametrize(
+    "bad", [sighting(0.05, evidence=-7.0), dataclasses.replace(sighting(0.05), length=0.06)]
+)
+def test_one_bad_sighting_does_not_outweigh_good_ones(
+    settings: StereoTrackerParameters, bad: Sighting
+) -> None:
+    track = NeedleTrack.begin(bad, 0.05, settings)
+    assert track.log_odds() < 0.0
+    for n in range(1, 6):
+        depth = 0.05 + 1e-3 * n
+        track = track.predicted(depth, settings).updated(sighting(depth), settings)
+    assert track.log_odds() > ACCEPTED
+
+
+def test_good_sightings_do_not_outweigh_the_recent_bad_ones(
+    settings: StereoTrackerParameters,
+) -> None:
+    depths = [0.05 + 1e-3 * n for n in range(40)]
+    track = after(settings, depths, list(depths))
+    for n in range(30):
+        depth = depths[-1] + 1e-3 * (n + 1)
+        bad = sighting(depth, evidence=-7.0)
+        track = track.predicted(depth, settings).updated(bad, settings)
+    assert track.log_odds() < 0.0

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
 
+from drawn_needles import arc
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
@@ -21,7 +22,6 @@ from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
-MakeArc = Callable[..., np.ndarray]
 
 
 @pytest.fixture
@@ -126,7 +126,7 @@ def test_same_images_give_the_same_bits(
 
 
 def test_no_function_is_compiled_after_the_warm_up(
-    tracker: NeedleTracker, draw_pair: Drawer, make_arc: Callable[..., np.ndarray]
+    tracker: NeedleTracker, draw_pair: Drawer
 ) -> None:
     """The length of the first needle must not cause a compilation, which takes seconds."""
 
@@ -145,7 +145,7 @@ def test_no_function_is_compiled_after_the_warm_up(
     before = compiled_for()
     assert len(before) > 10
     for length in (0.012, 0.11):
-        images = draw_pair(make_arc(length, 4.0, 0.5))
+        images = draw_pair(arc(length, 4.0, 0.5))
         for insertion in (length, None):
             tracker.reset()
             for _ in range(2):
@@ -163,9 +163,9 @@ def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Draw
 
 
 def test_a_blocked_camera_loses_the_track_until_it_is_clear(
-    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
+    tracker: NeedleTracker, draw_pair: Drawer
 ) -> None:
-    left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
+    left, right = draw_pair(arc(0.05, 5.0, 1.0))
     assert tracker.process(left, right, 0.05).state is TrackState.TRACKING
     blocked = np.full_like(right, 140)
     answers = [tracker.process(left, blocked, 0.05) for _ in range(FILTER.lost_after)]
@@ -178,25 +178,25 @@ def test_a_blocked_camera_loses_the_track_until_it_is_clear(
 
 
 def test_without_an_encoder_a_needle_that_advanced_undetected_is_found_again(
-    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
+    tracker: NeedleTracker, draw_pair: Drawer
 ) -> None:
     for mm in range(48, 52):
-        tracker.process(*draw_pair(make_arc(1e-3 * mm, 5.0, 1.0), seed=mm), None)
+        tracker.process(*draw_pair(arc(1e-3 * mm, 5.0, 1.0), seed=mm), None)
     while (answer := tracker.skip("covered")).state is not TrackState.LOST:
         assert answer.tip is None
     for mm in range(65, 68):
-        path = make_arc(1e-3 * mm, 5.0, 1.0)
+        path = arc(1e-3 * mm, 5.0, 1.0)
         answer = tracker.process(*draw_pair(path, seed=mm), None)
     assert answer.tip is not None
     assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
 
 
 def test_without_an_encoder_a_needle_is_found_beside_an_old_static_track(
-    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
+    tracker: NeedleTracker, draw_pair: Drawer
 ) -> None:
-    old, reasons = make_arc(0.045, 5.0, 0.5), []
+    old, reasons = arc(0.045, 5.0, 0.5), []
     for mm in [40] * 2 + list(range(42, 50, 2)):
-        path = make_arc(1e-3 * mm, 6.0, 2.6)
+        path = arc(1e-3 * mm, 6.0, 2.6)
         (left, right), (old_left, old_right) = (draw_pair(each, seed=mm) for each in (path, old))
         answer = tracker.process(np.minimum(left, old_left), np.minimum(right, old_right), None)
         reasons.append(answer.reason)
@@ -206,10 +206,8 @@ def test_without_an_encoder_a_needle_is_found_beside_an_old_static_track(
     assert reasons[-2:] == ["", ""]
 
 
-def test_a_black_image_is_reported(
-    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
-) -> None:
-    left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
+def test_a_black_image_is_reported(tracker: NeedleTracker, draw_pair: Drawer) -> None:
+    left, right = draw_pair(arc(0.05, 5.0, 1.0))
     for insertion in (0.001, 0.05, None):
         measured = tracker.process(left, np.zeros_like(right), insertion)
         assert measured.tip is None

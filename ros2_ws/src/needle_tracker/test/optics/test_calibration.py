@@ -117,9 +117,6 @@ def no_window(content: Any) -> None:
         del content[side]["window"]
 
 
-LAYER = ("right", "window", "layers", 0, "thickness")
-
-
 def test_bad_windows_are_named(own_windows: Any) -> None:
     for spoil, named in (
         (put("phantom", {"surface_height": 0.01, "refractive_index": 1.3}), "take phantom out"),
@@ -130,8 +127,7 @@ def test_bad_windows_are_named(own_windows: Any) -> None:
         (put("left", "window", "normal", [-1.0, 0.0, 0.0]), "normal must point to the camera"),
         (put("left", "window", "layers", None), "layers = None is not a list"),
         (put("left", "window", "layers", [{"thickness": 0.005}]), "layers.0..refractive_index"),
-        (put(*LAYER, -1e-3), "layers.0..thickness"),
-        (put(*LAYER, 5), "right.window.layers.0..thickness"),
+        (put("right", "window", "layers", 0, "thickness", -1e-3), "layers.0..thickness"),
         (put("right", "window", "inside", 0.9), "right.window.inside"),
         (put("right", "window", "point", [0.0, 0.06]), "right.window.point needs 3 numbers"),
     ):
@@ -140,19 +136,6 @@ def test_bad_windows_are_named(own_windows: Any) -> None:
         with pytest.raises(UserError, match=named) as caught:
             parse_calibration(content)
         assert "\n" not in str(caught.value)
-
-
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    for data, says in (
-        (None, "No such file"),
-        (b"\xff\xfe\x80\x81", "not a text file"),
-        (b"", "phantom"),
-        (b"[1, 2]", "rig.yaml"),
-        (b"{a: [", "YAML"),
-        (b"phantom: 3", "phantom"),
-    ):
-        if data is not None:
-            path.write_bytes(data)
-        with pytest.raises(UserError, match=says):
-            load_calibration(path)
+    for other in ([1, 2], {"phantom": 3}):
+        with pytest.raises(UserError, match="phantom"):
+            parse_calibration(other)

@@ -9,21 +9,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import drawn_needles
 from needle_tracker.detector.end_fit import ImageEnd
 from needle_tracker.detector.end_search import ShaftPath
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.stereo.sighting import (
     StereoSearch,
     evidence,
-    is_reachable,
-    shaft_length,
     shaft_points,
 )
 from needle_tracker.stereo.triangulation import triangulate
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Views = tuple[RefractedCamera, RefractedCamera]
-MakeArc = Callable[..., np.ndarray]
+Search = Callable[..., StereoSearch]
 
 
 @dataclasses.dataclass
@@ -45,7 +44,7 @@ class SeenLines:
 
 
 @pytest.fixture
-def search(views: Views, settings: StereoTrackerParameters) -> Callable[..., StereoSearch]:
+def search(views: Views, settings: StereoTrackerParameters) -> Search:
     def make(left: list[np.ndarray], right: list[np.ndarray]) -> StereoSearch:
         detectors = SeenLines(views[0], left), SeenLines(views[1], right)
         return StereoSearch(views, detectors, settings)  # type: ignore[arg-type]
@@ -54,13 +53,11 @@ def search(views: Views, settings: StereoTrackerParameters) -> Callable[..., Ste
 
 
 @pytest.fixture
-def needle(make_arc: MakeArc) -> np.ndarray:
-    return np.asarray(make_arc(0.06, 6.0, 0.7))
+def needle() -> np.ndarray:
+    return drawn_needles.arc(0.06, 6.0, 0.7)
 
 
-def test_the_end_in_only_one_view_is_reported(
-    search: Callable[..., StereoSearch], needle: np.ndarray
-) -> None:
+def test_the_end_in_only_one_view_is_reported(search: Search, needle: np.ndarray) -> None:
     sightings, (left, right) = search([needle], []).search(3e-3, 0.15)
     assert sightings == []
     assert left is not None
@@ -68,42 +65,33 @@ def test_the_end_in_only_one_view_is_reported(
     assert right is None
 
 
-def test_one_needle_in_both_views_is_one_sighting(
-    search: Callable[..., StereoSearch], needle: np.ndarray
-) -> None:
+def test_one_needle_in_both_views_is_one_sighting(search: Search, needle: np.ndarray) -> None:
     (sighting,) = search([needle], [needle]).search(3e-3, 0.15)[0]
     np.testing.assert_allclose(sighting.tip.position, needle[-1], atol=0.05e-3)
     assert sighting.length == pytest.approx(0.06, abs=0.2e-3)
     assert sighting.evidence > 4.0
 
 
-def test_a_line_in_only_one_view_is_no_sighting(
-    search: Callable[..., StereoSearch], needle: np.ndarray, make_arc: MakeArc
-) -> None:
-    line = make_arc(0.09, 3.0, -1.5)
-    assert search([line], []).search(3e-3, 0.15)[0] == []
+def test_a_line_in_only_one_view_is_no_sighting(search: Search, needle: np.ndarray) -> None:
+    line = drawn_needles.arc(0.09, 3.0, -1.5)
     found = search([line, needle], [needle]).search(3e-3, 0.15)[0]
     assert len(found) == 1
     np.testing.assert_allclose(found[0].tip.position, needle[-1], atol=0.05e-3)
 
 
-def test_a_shadow_on_the_floor_is_no_sighting(
-    search: Callable[..., StereoSearch], needle: np.ndarray
-) -> None:
+def test_a_shadow_on_the_floor_is_no_sighting(search: Search, needle: np.ndarray) -> None:
     shadow = needle * [0.0, 1.0, 1.0] - [0.02, 0.0, 0.0]
     assert search([shadow], [shadow]).search(3e-3, 0.15)[0] == []
 
 
 def test_a_line_whose_tangent_misses_the_entry_is_no_sighting(
-    search: Callable[..., StereoSearch], needle: np.ndarray
+    search: Search, needle: np.ndarray
 ) -> None:
     beside = needle + np.array([0.0, 0.017, 0.0])
     assert search([beside], [beside]).search(3e-3, 0.15)[0] == []
 
 
-def test_sightings_are_only_at_the_given_distances(
-    search: Callable[..., StereoSearch], needle: np.ndarray
-) -> None:
+def test_sightings_are_only_at_the_given_distances(search: Search, needle: np.ndarray) -> None:
     assert search([needle], [needle]).search(0.07, 0.08)[0] == []
 
 
@@ -170,36 +158,9 @@ def test_the_steps_of_the_cells_are_smoothed(views: Views, roll: float) -> None:
     assert distance_to(found, arc(4.0, roll, count=20_001)).max() < 1e-3
 
 
-def test_a_needle_is_reachable_and_its_length_is_right(
-    views: Views, settings: StereoTrackerParameters
-) -> None:
-    points = arc(5.0, 1.0)
-    found = shaft_points(views, (seen(views[0], points), seen(views[1], points)), points[-1])
-    assert is_reachable(found, settings)
-    assert shaft_length(found) == pytest.approx(LENGTH, abs=0.05e-3)
-
-
-def test_a_shadow_on_the_floor_is_not_reachable(
-    views: Views, settings: StereoTrackerParameters
-) -> None:
-    shadow = arc(5.0, 1.0)
-    shadow[:, 0] = -20e-3
-    found = shaft_points(views, (seen(views[0], shadow), seen(views[1], shadow)), shadow[-1])
-    assert distance_to(found, shadow).max() < 0.3e-3
-    assert not is_reachable(found, settings)
-
-
 def test_a_line_along_the_baseline_has_no_shaft_points(views: Views) -> None:
     y = np.linspace(-20e-3, 20e-3, 130)
     line = np.stack([0.0 * y, y, np.full_like(y, 62.5e-3)], axis=1)
     # There, the rays of both images are coplanar, and their intersection is undetermined.
     found = shaft_points(views, (seen(views[0], line), seen(views[1], line)), line[-1])
     np.testing.assert_array_equal(found, line[-1:])
-
-
-def test_lines_that_do_not_meet_leave_the_tip_alone(views: Views) -> None:
-    points = arc(5.0, 0.0)
-    other = points + np.array([0.0, 30e-3, 0.0])
-    found = shaft_points(views, (seen(views[0], points), seen(views[1], other)), points[-1])
-    np.testing.assert_array_equal(found[-1], points[-1])
-    assert len(found) == 1 or distance_to(found[:-1], points).min() > 1e-3

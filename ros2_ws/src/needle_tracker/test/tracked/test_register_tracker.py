@@ -52,21 +52,6 @@ def test_the_claimed_error_is_that_of_many_registrations() -> None:
     assert math.sqrt(np.mean(left_out)) > math.sqrt(3.0) * FLE
 
 
-def swapped(i: int, j: int) -> Callable[[np.ndarray, np.ndarray], Any]:
-    def swap(rig: np.ndarray, tracker: np.ndarray) -> None:
-        tracker[[i, j]] = tracker[[j, i]]
-
-    return swap
-
-
-def put(k: int, place: Any) -> Callable[[np.ndarray, np.ndarray], Any]:
-    def change(rig: np.ndarray, tracker: np.ndarray) -> None:
-        rig[k] = place
-        tracker[k] = measured(rig, 1, 0.0)[k]
-
-    return change
-
-
 def only(*rig: tuple[float, float, float]) -> Callable[[np.ndarray, np.ndarray], Any]:
     """Return points at these places in `rig` [mm]."""
     points = 1e-3 * np.array(rig)
@@ -76,11 +61,6 @@ def only(*rig: tuple[float, float, float]) -> Callable[[np.ndarray, np.ndarray],
 BAD_POINTS: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
     "two points": (lambda r, t: (r[:2], t[:2]), "number of points = 2 is outside [3, inf]"),
     "on a line": (only((0, 0, 0), (1, 0, 50), (0, 1, 100), (0, 0, 140)), "rig are within 0"),
-    "on a line in tracker": (
-        lambda r, t: (r, np.outer(np.arange(6.0), [0.01, 0.02, 0.03])),
-        "in tracker are within 0.00 mm of a line",
-    ),
-    "same point": (put(1, RIG[0]), "distance of A and B in rig = 0 mm"),
     "same measurement": (
         lambda r, t: (r, t[[0, 0, 2, 3, 4, 5]]),
         "distance of A and B in tracker = 0 mm",
@@ -89,22 +69,20 @@ BAD_POINTS: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
         only((0, 0, 0), (0, 50, 0), (0, 50, 50), (0, 0, 50)),
         "an exchange of A and C would not be noticed",
     ),
-    "isosceles": (only((0, 0, 0), (0, 50, 0), (0, 25, 80)), "an exchange of A and B"),
-    "A and B swapped": (swapped(0, 1), "A and B are exchanged"),
-    "B and F swapped": (swapped(1, 5), "B and F are exchanged"),
-    "two swaps": (
-        lambda r, t: (r, t[[1, 0, 3, 2, 4, 5]]),
-        "the points do not fit: fiducial error",
-    ),
+    "A and B swapped": (lambda r, t: (r, t[[1, 0, 2, 3, 4, 5]]), "A and B are exchanged"),
     "rotated list": (lambda r, t: (r, np.roll(t, 1, axis=0)), "the points do not fit"),
     "mirrored": (lambda r, t: (r, t * [1, 1, -1]), "an axis of the tracker is mirrored"),
-    "metres": (lambda r, t: (r, 1e-3 * t), "distance of A and B in tracker = 0.0"),
     "micrometres": (lambda r, t: (r, 1e3 * t), "outside [-10000, 10000]"),
     "inches": (lambda r, t: (r, t / 25.4 * 10.0), "distances in tracker are 0.39"),
-    "typing error": (lambda r, t: r.__setitem__((3, 1), 0.005), "D does not fit the others"),
-    "5 mm off": (lambda r, t: t.__setitem__((4, 2), t[4, 2] + 5e-3), "E does not fit the others"),
-    "noisy": (lambda r, t: (r, measured(r, 2, 3e-3)), "the points do not fit"),
-    "two axes exchanged": (lambda r, t: (r, t[:, [1, 0, 2]]), "an axis of the tracker is mirrored"),
+    "5 mm off": (
+        lambda r, t: (r, t + np.outer(np.eye(6)[4], [0.0, 0.0, 5e-3])),
+        "E does not fit the others",
+    ),
+    # Three points leave no error at a point left out.
+    "one of three off": (
+        lambda r, t: (r[:3], t[:3] + np.outer(np.eye(3)[2], [0.0, 0.0, 8e-3])),
+        "fiducial error",
+    ),
     "far away": (
         only((0, 0, -3000), (0, 20, -3000), (20, 0, -3020)),
         "standard deviation at the entry point",
@@ -115,11 +93,8 @@ BAD_POINTS: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
 @pytest.mark.parametrize("case", BAD_POINTS)
 def test_bad_points_are_refused_by_name(case: str, tmp_path: Path, monkeypatch: Any) -> None:
     change, text = BAD_POINTS[case]
-    rig, tracker = RIG.copy(), measured(RIG)
-    changed: Any = change(rig, tracker)
-    points = changed if isinstance(changed, tuple) else (rig, tracker)
     with pytest.raises(UserError) as error:
-        run(tmp_path, monkeypatch, *points)
+        run(tmp_path, monkeypatch, *change(RIG, measured(RIG)))
     assert text in str(error.value)
     assert not (tmp_path / "out.yaml").exists()
 
@@ -182,7 +157,6 @@ def test_bad_pivot_is_refused_by_name(table: np.ndarray, text: str) -> None:
     [
         ("T_rig_tracker", None, "not YAML"),
         ("sensor_std", "sensor_std: 0.0", "sensor_std = 0 m is outside"),
-        ("sensor_std", "sensor_std: .nan", "sensor_std = nan is not a finite number"),
         ("centroid", "centroid: [0, 0]", "centroid needs 3 numbers"),
         ("tip_offset", "tip_offset: [0, 0, 150]", "length of tip_offset = 150 m"),
         ("  rotation", "  rotation: [0, 0, 0, 0]", "norm of T_rig_tracker.rotation = 0"),
