@@ -40,7 +40,7 @@ from needle_core.message_types import NANOSECONDS, rclpy_types, to_nanoseconds
 from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.ros.base_node import IMAGES
 from needle_core.settings.parameter_files import Parameters
-from needle_device_driver.conformance.rig import Held
+from needle_device_driver.conformance.rig import HandState
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.cameras import camera_info_message, image_message
@@ -116,7 +116,7 @@ def draw(folder: Path, depth: float) -> None:
         sensors.append(_DrawingSensor(*parts))
         return sensors[0]
 
-    hold = lambda seconds: Held(pressed=seconds > 0.2)  # noqa: E731
+    hold = lambda seconds: HandState(pressed=seconds > 0.2)  # noqa: E731
     steer(hold, 1, latency=0.01, new_sensor=make_sensor, depth=depth, nominal_speed=SPEED)
     np.save(folder / _IMAGES_FILE, np.array(sensors[0].images))
     np.save(folder / _INSERTIONS_FILE, np.array(sensors[0].insertions))

@@ -60,7 +60,7 @@ def random_steps(count: int) -> tuple[list[float], list[str], float]:
     rng, rig, memory = random.Random(1), VirtualRig(1), [0.0]
     rig.home()
     rig.press()
-    at = list(rig.place)
+    at = list(rig.positions)
     for number in range(count):
         # Log-uniform from 0.01 mm.
         length = math.exp(rng.uniform(math.log(1e-5), math.log(_STEP)))
@@ -72,7 +72,7 @@ def random_steps(count: int) -> tuple[list[float], list[str], float]:
             rig.until(lambda: rig.hand.status.activity == "none", "its end")
             rig.press()
             # A retraction ends at the home switch, a few counts from 0.
-            at[0] = rig.place[0]
+            at[0] = rig.positions[0]
         at = [at[0] + length, at[1] + turn]
         # Margin: rounding of the start to a count must not make the fastest step too fast.
         duration = max(length / FASTEST, abs(turn) / 3.0) * rng.uniform(1.01, 1.5)
@@ -81,7 +81,7 @@ def random_steps(count: int) -> tuple[list[float], list[str], float]:
         if number in (count // 10, count - 1):
             memory.append(_memory())
     rig.runner.run(0.1)
-    off = [(a - b) * c for a, b, c in zip(rig.place, at, _COUNTS, strict=True)]
+    off = [(a - b) * c for a, b, c in zip(rig.positions, at, _COUNTS, strict=True)]
     return off, list(rig.hand.results.values()), (memory[-1] - memory[1]) / 1e6
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.component import Actions, Moment
-from needle_device_driver.conformance.rig import FASTEST, Held
+from needle_device_driver.conformance.rig import FASTEST, HandState
 from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import Sensor, TipSensor
 from needle_sim.sim_rig import SimRig
@@ -26,7 +26,7 @@ TIP_STD = 5e-5
 FRAME_RATE = 30.0
 _LONGEST = 600.0
 _STEERING = ("STEERING", "WAITING_FOR_TIP")
-Hand = Callable[[float], Held]
+Hand = Callable[[float], HandState]
 """Function from the time since the begin of steering [s] to the state of the hand."""
 
 
@@ -105,7 +105,7 @@ def steer(
 
     def tell(bench: SimulatedBench, now: float) -> None:
         nonlocal before
-        rig.hand.held = held = hand(now - begun)
+        rig.hand.state = held = hand(now - begun)
         motor.position += held.push * (now - before) * counts
         before = now
         path.append((bench.insertion, float(bench.tip[0])))
@@ -127,16 +127,16 @@ def rms_at_end(path: np.ndarray, length: float = 0.02) -> float:
 
 def constant(speed: float) -> Hand:
     """Return a hand that holds at a speed [m/s]."""
-    return lambda _: Held(True, speed / FASTEST)
+    return lambda _: HandState(True, speed / FASTEST)
 
 
 def changing(rng: np.random.Generator) -> Hand:
     """Return a hand that changes speed, stops or releases every 0.3 to 3 s."""
     share = _pieces(rng)
 
-    def hand(time: float) -> Held:
+    def hand(time: float) -> HandState:
         u = share(time)
-        return Held(u >= 0.1, 0.0 if u < 0.2 else u)
+        return HandState(u >= 0.1, 0.0 if u < 0.2 else u)
 
     return hand
 
@@ -146,11 +146,11 @@ def pushing(rng: np.random.Generator) -> Hand:
     share = _pieces(rng)
     jerks = rng.uniform(size=round(_LONGEST / 0.05)) < 0.03
 
-    def hand(time: float) -> Held:
+    def hand(time: float) -> HandState:
         u = share(time)
         jerk = jerks[int(time / 0.05)]
         push = 0.02 if jerk else 0.0 if u < 0.2 else u * FASTEST
-        return Held(True, push=push) if u >= 0.1 else Held(False)
+        return HandState(True, push=push) if u >= 0.1 else HandState(False)
 
     return hand
 

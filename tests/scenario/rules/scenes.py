@@ -9,7 +9,7 @@ from functools import partial
 from needle_core import messages as m
 from needle_core.component import Call, Publish
 from needle_device_driver.axes.axis import PERIOD
-from needle_device_driver.conformance.rig import AXES, Held
+from needle_device_driver.conformance.rig import AXES, HandState
 from needle_device_driver.rules import Rule
 from scenario.virtual_rig import COMMANDS, HOLD, STATUS, VirtualRig
 
@@ -36,7 +36,7 @@ def hold_new_press() -> None:
     """A press from before the axes were enabled moves nothing."""
     scene = VirtualRig(1)
     scene.home()
-    scene.hand.held = Held(True)
+    scene.hand.state = HandState(True)
     scene.runner.run(0.1)
     scene.call("device/enable", False)
     scene.call("device/enable", True)
@@ -71,7 +71,7 @@ def speed_scale() -> None:
     """A speed scale that is not a number is a release."""
     scene = VirtualRig(1)
     scene.moving()
-    scene.hand.held = Held(True, math.nan)
+    scene.hand.state = HandState(True, math.nan)
     scene.runner.run(0.1)
     assert scene.is_at_rest()
     assert scene.hand.status.hold_owner == ""
@@ -138,12 +138,12 @@ def coordinated() -> None:
     """Rotation follows insertion in proportion, also while the speed scale changes."""
     scene = VirtualRig(1)
     scene.ready()
-    positions = [scene.place]
+    positions = [scene.positions]
     stamp = scene.step()
     while stamp not in scene.hand.results:
-        scene.hand.held = Held(True, 1.0 if len(positions) < 10 else 0.3)
+        scene.hand.state = HandState(True, 1.0 if len(positions) < 10 else 0.3)
         scene.runner.run(PERIOD)
-        positions.append(scene.place)
+        positions.append(scene.positions)
     begin, end = positions[0], positions[-1]
     for at in positions:
         insertion, rotation = (
@@ -174,7 +174,7 @@ def axis_speed() -> None:
     scene.begin_homing()
     scene.runner.run(1.0)
     assert scene.fails(Rule.AXIS_SPEED)
-    assert DEEP - scene.place[0] < 0.008
+    assert DEEP - scene.positions[0] < 0.008
 
 
 def software_limits() -> None:

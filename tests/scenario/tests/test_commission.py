@@ -74,10 +74,10 @@ def test_real_drives_move_only_while_a_person_holds(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(backend, "are_emulated", are_emulated)
     rig = ConformanceRig(1)
-    begin = rig.place
+    begin = rig.positions
     with pytest.raises(UserError, match="only while a person holds"):
         list(commission(rig, Person(rig)))
-    assert rig.place == begin
+    assert rig.positions == begin
 
 
 def test_a_wrong_scale_and_a_long_distance_do_not_pass() -> None:

@@ -57,7 +57,7 @@ def test_a_step_moves_in_equal_cycles_to_its_target() -> None:
     stamp = rig.command(0.002, 0.5, 1.0)
     rig.until(lambda: stamp in rig.hand.results, "the result")
     assert rig.hand.results[stamp] == "succeeded"
-    assert rig.place == pytest.approx((0.002, 0.5), abs=1e-3)
+    assert rig.positions == pytest.approx((0.002, 0.5), abs=1e-3)
     assert rig.hand.status.simulated
     assert rig.hand.status.watchdog_trips == 0
     times = [time for time, _ in bus.orders(SYNC, since=begin)]
@@ -80,7 +80,7 @@ def test_drives_that_report_speeds_in_rpm_home_at_the_requested_speed() -> None:
     rig = VirtualRig(1, drives={"rpm": True, "insertion_start": 0.002})
     # 2 mm at 2 mm/s, and the distance off the switch.
     assert 1.0 < home(rig) < 1.6
-    assert rig.place[0] == pytest.approx(0.0, abs=2e-5)
+    assert rig.positions[0] == pytest.approx(0.0, abs=2e-5)
 
 
 @pytest.mark.parametrize("start", [-0.0005, 0.0, 0.00003])
@@ -104,7 +104,7 @@ def test_aborted_and_continued_steps_raise_no_alarm(lag: float, late: float) -> 
         rig.release()
         rig.press()
     assert rig.hand.status.state in ("HOLDING", "MOVING"), rig.hand.status.fault
-    assert rig.place[0] > 0.001
+    assert rig.positions[0] > 0.001
 
 
 def test_drives_are_set_up_in_parallel_and_homing_starts_when_both_have_limits() -> None:

@@ -23,7 +23,7 @@ def mixed(drives: str) -> ConformanceRig:
 
 def zaber(*, has_encoder: bool = True, late: float = 0.0) -> ConformanceRig:
     rig = mixed("zaber")
-    chain = rig.behind("insertion")
+    chain = rig.emulator("insertion")
     for drive in chain.drives.values():
         drive.has_encoder = has_encoder
     chain.late, chain.partial = late, late > 0.0
@@ -47,7 +47,7 @@ def test_a_fast_step_ends_where_it_should(make: Callable[[], ConformanceRig]) ->
     assert rig.hand.results[stamp] == "succeeded"
     assert rig.hand.status.simulated
     # The driver sets the home where it observes that the axis has left the switch.
-    assert rig.place == pytest.approx((0.002, 0.5), abs=1e-4)
+    assert rig.positions == pytest.approx((0.002, 0.5), abs=1e-4)
     assert rig.hand.joints == pytest.approx((0.002, 0.5), abs=2.5e-4)
 
 
@@ -82,7 +82,7 @@ def test_each_set_point_is_ordered_once(monkeypatch: pytest.MonkeyPatch) -> None
 def test_homing_writes_the_limits_and_set_points_are_bounded() -> None:
     rig = mixed("galil")
     rig.ready()
-    registers = rig.behind("insertion").drives["insertion"].registers
+    registers = rig.emulator("insertion").drives["insertion"].registers
     scale = rig.settings.insertion_counts_per_unit
     assert (registers["FL"] - registers["BL"]) / scale == pytest.approx(0.202, abs=1e-5)
     with pytest.raises(AxisError, match=r"set-point step of 0.00019.* limit") as refused:
@@ -121,7 +121,7 @@ def reboot_at_once(chain: ZaberDrives, now: float) -> None:
 def test_the_cause_is_named(event: Callable[[Any, float], None], cause: str) -> None:
     rig = zaber()
     rig.moving()
-    event(rig.behind("insertion"), rig.runner.now)
+    event(rig.emulator("insertion"), rig.runner.now)
     rig.runner.run(0.4)
     assert cause in rig.hand.status.fault
 
@@ -129,5 +129,5 @@ def test_the_cause_is_named(event: Callable[[Any, float], None], cause: str) -> 
 def test_power_by_another_program_is_a_fault() -> None:
     rig = zaber()
     rig.start()
-    rig.behind("insertion").foreign("/2 1 driver enable")
+    rig.emulator("insertion").foreign("/2 1 driver enable")
     assert rig.fails(Rule.ONE_MASTER)

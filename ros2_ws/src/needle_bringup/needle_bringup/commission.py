@@ -153,14 +153,14 @@ def commission(rig: ConformanceRig, ask: Ask, *, has_pedal: bool = False) -> Ite
         raise UserError("real drives move only while a person holds: add a section `operator`")
     ask("The stage will move outwards to its switch.")
     rig.home()
-    begin = rig.place
+    begin = rig.positions
     _enable(rig)
     rig.runner.run(_SETTLED)
     yield Row("no_motion_by_itself", "switched on", rig.distance(begin)[0], 0.0)
     for _ in range(round(_DISTANCE / _STEP)):
         _step(rig, 1.0)
         rig.until(lambda: rig.commands[-1] in rig.hand.results, "the end of a step")
-    moved_mm = (rig.place[0] - begin[0]) * 1e3
+    moved_mm = (rig.positions[0] - begin[0]) * 1e3
     answer = ask(f"The stage has moved {moved_mm:.3f} mm. Measure it, and type your value in mm.")
     measured_mm = number("value", answer, 0.0, 1e3, "mm") if answer else math.nan
     error = abs(measured_mm - moved_mm) * 1e-3
@@ -184,7 +184,7 @@ def _stop(rig: ConformanceRig, fault: Fault, ask: Ask, by_hand: str) -> Row:
         rig.release()
         rig.call("device/reset")
         rig.runner.run(0.5)
-        measured = abs(rig.place[0] - before) if rig.hand.status.homed else math.nan
+        measured = abs(rig.positions[0] - before) if rig.hand.status.homed else math.nan
         return Row(fault.rule.value, by_hand, measured, bound)
     _step(rig, _STEP_TIME)
     rig.runner.run(0.5 * _STEP_TIME)
@@ -197,9 +197,9 @@ def _steps_until_stop(rig: ConformanceRig) -> float:
     outcome = "succeeded"
     while outcome == "succeeded":
         _step(rig, _STEP_TIME)
-        position, outcome = rig.place[0], ""
+        position, outcome = rig.positions[0], ""
         while not outcome and rig.state in ("HOLDING", "MOVING"):
-            position = rig.place[0]
+            position = rig.positions[0]
             rig.runner.run(PERIOD)
             outcome = rig.hand.results.get(rig.commands[-1], "")
     rig.runner.run(_SETTLED)
@@ -212,7 +212,7 @@ def _step(rig: ConformanceRig, duration: float) -> None:
         _enable(rig)
     if not rig.hand.status.hold_owner:
         rig.press()
-    rig.command(rig.place[0] + _STEP, rig.place[1], duration)
+    rig.command(rig.positions[0] + _STEP, rig.positions[1], duration)
 
 
 def _enable(rig: ConformanceRig) -> None:

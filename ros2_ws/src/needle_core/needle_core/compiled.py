@@ -90,8 +90,8 @@ def _cache_directory(package: Path) -> str:
         source = path.read_bytes()
         if _COMPILED.search(source) or path == Path(__file__):
             digest.update(source)
-    for place in _places():
-        folder = place / "needle_steering" / package.name / digest.hexdigest()[:16]
+    for root in _cache_roots():
+        folder = root / "needle_steering" / package.name / digest.hexdigest()[:16]
         with contextlib.suppress(OSError):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             if os.access(folder, os.W_OK | os.X_OK):
@@ -99,11 +99,11 @@ def _cache_directory(package: Path) -> str:
     return ""
 
 
-def _places() -> list[Path]:
+def _cache_roots() -> list[Path]:
     """Return the candidate cache folders, best first."""
     named = (os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
-    places = [Path(place) for place in named if place]
+    roots = [Path(root) for root in named if root]
     # Path.home() fails if neither HOME nor the password database names a home.
     with contextlib.suppress(RuntimeError):
-        places.append(Path.home() / ".cache")
-    return [place for place in places if place.is_absolute()]
+        roots.append(Path.home() / ".cache")
+    return [root for root in roots if root.is_absolute()]

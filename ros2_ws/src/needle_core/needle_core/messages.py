@@ -373,7 +373,7 @@ def quaternion_from_rotation(rotation: Sequence[Sequence[float]]) -> Quaternion:
         (yy, (xy + yx, 1.0 - trace + 2.0 * yy, zy + yz, xz - zx)),
         (zz, (xz + zx, yz + zy, 1.0 - trace + 2.0 * zz, yx - xy)),
         (trace, (zy - yz, xz - zx, yx - xy, 1.0 + trace)),
-        key=lambda way: way[0],
+        key=lambda candidate: candidate[0],
     )
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     return (x / norm, y / norm, z / norm, w / norm)

@@ -2,18 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 
-from needle_device_driver.procedure import (
-    Procedure,
-    Running,
-    Wait,
-    run,
-    run_at_once,
-    side_by_side,
-)
+from needle_device_driver.procedure import Procedure, Running, Wait, run_at_once, side_by_side
 
 
 class Script:
@@ -55,14 +46,7 @@ def test_procedure_resumes_by_condition_or_time_out() -> None:
     assert script.steps == ["first", "second"]
 
 
-def test_run_waits_and_run_at_once_refuses_to() -> None:
-    waits: list[float] = []
-
-    def wait(_: Callable[[], bool], seconds: float) -> None:
-        waits.append(seconds)
-
-    assert run(Script().procedure(), wait, lambda: sum(waits)) == "done"
-    assert waits == pytest.approx([0.5, 0.1])
+def test_run_at_once_refuses_to_wait() -> None:
     with pytest.raises(RuntimeError, match="the procedure waits"):
         run_at_once(Script().procedure())
 

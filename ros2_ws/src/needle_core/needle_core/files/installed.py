@@ -18,10 +18,10 @@ def find_executable(package: str, executable: str) -> str:
     UserError
         If the environment has no such executable.
     """
-    places = [Path(sys.executable).parent, *(one / "lib" / package for one in _prefixes())]
-    for place in places:
-        if os.access(place / executable, os.X_OK):
-            return str(place / executable)
+    candidates = [Path(sys.executable).parent, *(one / "lib" / package for one in _prefixes())]
+    for folder in candidates:
+        if os.access(folder / executable, os.X_OK):
+            return str(folder / executable)
     raise UserError(_advice(f"{package} {executable}"))
 
 
@@ -33,14 +33,14 @@ def find_shared_file(package: str, file: str) -> Path:
     UserError
         If the environment has no such file.
     """
-    places = [prefix / "share" / package for prefix in (*_prefixes(), Path(sys.prefix))]
+    candidates = [prefix / "share" / package for prefix in (*_prefixes(), Path(sys.prefix))]
     module = find_spec(package)
     if module is not None and module.origin is not None:
         # In a checkout, edits take effect without a new installation.
-        places.insert(0, Path(module.origin).parents[1])
-    for place in places:
-        if (place / file).is_file():
-            return place / file
+        candidates.insert(0, Path(module.origin).parents[1])
+    for folder in candidates:
+        if (folder / file).is_file():
+            return folder / file
     raise UserError(_advice(f"{package}'s {file}"))
 
 

@@ -126,7 +126,8 @@ class ReopeningPort(abc.ABC, Generic[D]):
 
 def _error_text(error: Exception) -> str:
     """Return a one-line description of an error: the operating system's text if there is one."""
-    for cause in (error, error.__cause__, error.__context__):
+    context = None if error.__suppress_context__ else error.__context__
+    for cause in (error, error.__cause__, context):
         # Failed host name look-ups have negative numbers that strerror does not know.
         if isinstance(cause, OSError) and cause.errno and cause.errno > 0:
             return os.strerror(cause.errno)

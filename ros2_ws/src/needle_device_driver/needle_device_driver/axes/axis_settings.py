@@ -10,7 +10,7 @@ from needle_core.errors import OutOfBoundsError
 from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 
 Positive = Annotated[float, Bounds(ABOVE_0, math.inf, "SI")]
-HERE = (35, 37)
+PRESENT_POSITION_METHODS = (35, 37)
 """CiA 402 homing methods that define the present position as home."""
 
 

@@ -26,10 +26,6 @@ _OWN = {
 _PAGE = "docs/own_drives.md"
 
 
-def _no_check(parameters: Any) -> None:
-    """Accept all parameters."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Backend:
     """A kind of drive: the object of an entry point.
@@ -52,7 +48,7 @@ class Backend:
     settings: type[Any]
     make: Callable[[Any, Mapping[str, AxisSettings]], Drives]
     open_port: Callable[[Any], RealPort]
-    check: Callable[[Any], None] = _no_check
+    check: Callable[[Any], None] = lambda _: None
 
 
 def backends() -> dict[str, Backend]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import fixed_parameter
-from needle_device_driver.axes.axis_settings import HERE, AxisSettings
+from needle_device_driver.axes.axis_settings import PRESENT_POSITION_METHODS, AxisSettings
 from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.link import DriveError
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
@@ -187,7 +187,7 @@ class ZaberProtocol(DriveProtocol):
             yield from self._ask(at.target, "set pos 0")
         at.switches = {}
         # A rotation that is homed without a switch has no limit switches: save the requests.
-        has_ends = settings.unit == "m" or settings.homing_method not in HERE
+        has_ends = settings.unit == "m" or settings.homing_method not in PRESENT_POSITION_METHODS
         for switch in (_HOME, _AWAY) if has_ends else ():
             active = yield from self._ask(at.target, switch, is_optional=True)
             if active in ("0", "1"):
@@ -278,7 +278,6 @@ class ZaberProtocol(DriveProtocol):
             return
         del request.missing[name, message_id]
         if not request.missing:
-            del self._requests[key]
             self.on_status(request.number, {name: _state(at) for name, at in self._axes.items()})
 
     def _is_intact(self, match: re.Match[str]) -> bool:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from needle_core.errors import UserError
 from needle_core.settings.bounds import Bounds
-from needle_device_driver.axes.axis_settings import HERE, AxisSettings, Positive
+from needle_device_driver.axes.axis_settings import PRESENT_POSITION_METHODS, AxisSettings, Positive
 from needle_device_driver.axes.link import DriveError
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.object_access import ObjectAccess, ObjectError
@@ -16,7 +16,7 @@ from needle_device_driver.procedure import Procedure
 # Homing methods that use an index pulse, and a switch.
 INDEX_PULSE = (*range(1, 15), 33, 34)
 SWITCHES = tuple(range(1, 15)) + tuple(range(17, 31))
-HOMING_METHODS = (*SWITCHES, 33, 34, *HERE)
+HOMING_METHODS = (*SWITCHES, 33, 34, *PRESENT_POSITION_METHODS)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -146,16 +146,17 @@ def _counts_in(
         _NUMERATORS.get(above, f"unit 0x{above:02X}")
         + _DENOMINATORS.get(below, f" per unit 0x{below:02X}")
     )
-    what, *wanted = _ACCEPTED[entry]
+    what, *accepted = _ACCEPTED[entry]
     turns = unit in _TURN_UNITS.values()
     turn = (yield from _counts_per_turn(access, settings)) if turns else 60.0
-    wanted = wanted[: 1 + bool(turn)]
-    if unit not in wanted or (power and entry is od.POSITION_UNIT):
+    accepted = accepted[: 1 + bool(turn)]
+    if unit not in accepted or (power and entry is od.POSITION_UNIT):
         scale = f"10^{power} " if power else ""
         unit_text = f"{scale}{unit} (0x{entry.index:04X} = 0x{code:08X})"
         hint = "; *_counts_per_turn converts rpm without 0x608F" if turns else ""
         raise ObjectError(
-            f"the drive measures {what} in {unit_text}, expected {' or '.join(wanted)}{hint}", entry
+            f"the drive measures {what} in {unit_text}, expected {' or '.join(accepted)}{hint}",
+            entry,
         )
     feed = None
     if turns and not settings.counts_per_turn:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from needle_device_driver.axes.axis_settings import HERE
+from needle_device_driver.axes.axis_settings import PRESENT_POSITION_METHODS
 from needle_device_driver.axes.link import DriveError
 from needle_device_driver.cia402.cia402 import (
     POWERED,
@@ -148,7 +148,7 @@ def _set_up_motion(
     stop_ramp = settings.magnitude(settings.quick_stop_deceleration, settings.ramp_unit)
     # Objects that a drive may lack: value, and if a rule depends on the object, the least and
     # greatest accepted value after rounding by the drive. A value outside them was clipped.
-    wanted: list[tuple[od.Entry, int, tuple[int, int] | None]] = [
+    objects: list[tuple[od.Entry, int, tuple[int, int] | None]] = [
         # Stop on ramps, never coast; a missing heartbeat is a fault, which latches.
         (od.SHUTDOWN_OPTION, 1, None),
         (od.DISABLE_OPTION, 1, None),
@@ -168,9 +168,9 @@ def _set_up_motion(
     ]
     if settings.max_torque > 0.0:
         torque = round(settings.max_torque * 1e3)
-        wanted.append((od.MAX_TORQUE, torque, (torque // 2 + 1, 2 * torque)))
+        objects.append((od.MAX_TORQUE, torque, (torque // 2 + 1, 2 * torque)))
     missing = []
-    for entry, value, accepted in wanted:
+    for entry, value, accepted in objects:
         missing.append((yield from _write_optional_object(access, entry, value, accepted)))
     return [text for text in missing if text]
 
@@ -234,16 +234,15 @@ def _try_mode(link: FrameLink, access: ObjectAccess, node: int, mode: Mode) -> P
 
 def _write_homing_method(access: ObjectAccess, method: int) -> Procedure[None]:
     # An older edition of the standard uses 35 for homing at the present position.
-    others = [other for other in HERE if other != method] if method in HERE else []
-    yield from _first_accepted(access.write(od.HOMING_METHOD, one) for one in (method, *others))
+    others = PRESENT_POSITION_METHODS if method in PRESENT_POSITION_METHODS else ()
+    methods = dict.fromkeys((method, *others))
+    yield from _first_accepted(access.write(od.HOMING_METHOD, one) for one in methods)
 
 
 def _write_heartbeat(access: ObjectAccess) -> Procedure[None]:
     try:
         yield from access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
-    except DriveRefusalError as error:
-        if error.object_is_missing:
-            raise
+    except DriveRefusalError:
         if not 0 < (yield from access.read(od.PRODUCER_HEARTBEAT)) <= _MAX_HEARTBEAT_MS:
             raise
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 
-from needle_device_driver.axes.axis_settings import HERE
+from needle_device_driver.axes.axis_settings import PRESENT_POSITION_METHODS
 from needle_device_driver.cia402.cia402 import (
     HOMING_ATTAINED,
     HOMING_ERROR,
@@ -90,7 +90,7 @@ class HomingRun:
         if self._reports_previous:
             near = abs(at.position) <= self._settings.magnitude(self._settings.tolerance)
             self._cycles_at_home = self._cycles_at_home + 1 if near else 0
-            here = self._settings.homing_method in HERE
+            here = self._settings.homing_method in PRESENT_POSITION_METHODS
             ended = self._cycles_at_home >= (_CYCLES_HERE if here else _CYCLES_AT_SWITCH)
         if ended:
             self.step = HomingStep.DONE

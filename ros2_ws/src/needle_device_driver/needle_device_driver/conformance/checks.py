@@ -35,15 +35,15 @@ def order_directly(make: Callable[..., ConformanceRig], *, stops: bool) -> float
     protocol.write_limits = write_tight
     rig.ready()
     rig.runner.freeze(DRIVER, 0.5)
-    begin = rig.place[0]
+    begin = rig.positions[0]
     target = home["insertion"] + settings.direction * settings.magnitude(200.0 * TIGHT)
     protocol.move_to("insertion", target, settings.magnitude(settings.speed))
     if stops:
         protocol.stop("insertion")
-    rig.behind("insertion").receive(protocol.link.pop_outgoing(), rig.runner.now)
+    rig.emulator("insertion").receive(protocol.link.pop_outgoing(), rig.runner.now)
     # No watchdog acts earlier.
     rig.runner.run(0.07)
-    return abs(rig.place[0] - begin)
+    return abs(rig.positions[0] - begin)
 
 
 def check_step(rig: ConformanceRig) -> None:

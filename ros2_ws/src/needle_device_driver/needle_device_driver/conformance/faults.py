@@ -53,7 +53,7 @@ def _act(action: Action) -> Event:
 
 
 def _of(axis: str, name: str, *values: int) -> Event:
-    return lambda rig: getattr(rig.behind(axis), name)(axis, *values)
+    return lambda rig: getattr(rig.emulator(axis), name)(axis, *values)
 
 
 def _unplug(rig: ConformanceRig) -> None:
@@ -76,11 +76,11 @@ FAULTS = (
           (_R.SETTLING_TIME, _R.DRIVE_EMERGENCY), in_steps=True),
     Fault("hanging drive", _R.REPLY_AGE, _of("rotation", "hang"), "silence"),
     Fault("cut line", _R.REPLY_AGE,
-          lambda rig: setattr(rig.behind("insertion"), "is_cut", True), "silence"),
+          lambda rig: setattr(rig.emulator("insertion"), "is_cut", True), "silence"),
     Fault("late replies", _R.REPLY_AGE, lambda rig: setattr(rig, "late", 0.2), "silence"),
     Fault("unplugged adapter", _R.LINK_LOSS, _unplug, "order"),
     Fault("power loss", _R.DRIVE_REBOOT,
-          lambda rig: rig.behind("rotation").reboot("rotation", rig.runner.now), "silence",
+          lambda rig: rig.emulator("rotation").reboot("rotation", rig.runner.now), "silence",
           (_R.REPLY_AGE,)),
     Fault("killed driver", _R.LOOK_AHEAD, lambda rig: rig.runner.kill(DRIVER), "order"),
     Fault("frozen driver", _R.DRIVE_WATCHDOG, lambda rig: rig.runner.freeze(DRIVER, 1.0), "order",

@@ -46,7 +46,7 @@ _JOINT_NAMES = (m.INSERTION_JOINT, m.ROTATION_JOINT)
 _TIMEOUT = 60.0
 
 
-class Held(NamedTuple):
+class HandState(NamedTuple):
     """State of the operator's hand.
 
     Attributes
@@ -74,7 +74,7 @@ class RigClient(Component):
 
     Attributes
     ----------
-    held : Held
+    state : HandState
         Present state of the hand.
     joints : tuple of float
         Last joint positions [m], [rad]; rotation is 0 after homing.
@@ -90,7 +90,7 @@ class RigClient(Component):
         self.results: dict[int, str] = {}
         self.answers: list[Answer] = []
         self.actions: list[Action] = []
-        self.held = Held(False)
+        self.state = HandState(False)
         self.session = HoldSession(self.name)
         self.inputs: Sequence[Input] = (
             Input(STATUS, DeviceStatus, self._on_status, LATCHED),
@@ -120,7 +120,7 @@ class RigClient(Component):
         return ()
 
     def _act(self, at: Moment) -> Actions:
-        pressed, speed, _ = self.held
+        pressed, speed, _ = self.state
         yield Publish(HOLD, self.session.next_message(at.stamp_ns, pressed=pressed, speed=speed))
         yield from self.actions
         self.actions = []
@@ -209,7 +209,7 @@ class ConformanceRig:
 
     def hold(self, pressed: bool) -> None:
         """Press or release the hold."""
-        self.hand.held = Held(pressed)
+        self.hand.state = HandState(pressed)
 
     def press(self) -> None:
         """Release, then press until the device reports this hold."""
@@ -256,9 +256,9 @@ class ConformanceRig:
     def moving(self, duration: float = 1.0) -> int:
         """Get ready, and run until a step of 2 mm is under way; return its stamp."""
         self.ready()
-        begin = self.place[0]
+        begin = self.positions[0]
         stamp = self.step(duration=duration)
-        self.until(lambda: self.place[0] > begin + 0.0005, "a step under way")
+        self.until(lambda: self.positions[0] > begin + 0.0005, "a step under way")
         return stamp
 
     def until(self, condition: Callable[[], bool], what: str) -> None:
@@ -284,12 +284,12 @@ class ConformanceRig:
         return self.hand.status.state
 
     @property
-    def place(self) -> tuple[float, float]:
+    def positions(self) -> tuple[float, float]:
         """True position of the motors [m], [rad]."""
         axes = self.drives.axes(self.runner.now)
         return axes["insertion"].position, axes["rotation"].position
 
-    def behind(self, axis: str) -> Any:
+    def emulator(self, axis: str) -> Any:
         """Return the emulated drives of an axis, which can be made to fail."""
         return next(one for one in self.drives.connections.values() if axis in one.motors)
 
@@ -310,13 +310,13 @@ class ConformanceRig:
 
     def distance(self, begin: tuple[float, float]) -> tuple[float, float]:
         """Return the distance of the motors from a position [m], [rad]; 0: at rest."""
-        ways = (abs(here - there) for here, there in zip(self.place, begin, strict=True))
+        distances = (abs(now - before) for now, before in zip(self.positions, begin, strict=True))
         settings = self.settings
         counts = settings.insertion_counts_per_unit, settings.rotation_counts_per_unit
         # Switching on moves a motor to the nearest count.
         insertion, rotation = (
-            0.0 if way <= max(most, 1.0 / scale) else way
-            for way, most, scale in zip(ways, AT_REST, counts, strict=True)
+            0.0 if distance <= max(most, 1.0 / scale) else distance
+            for distance, most, scale in zip(distances, AT_REST, counts, strict=True)
         )
         return insertion, rotation
 
@@ -327,7 +327,7 @@ class ConformanceRig:
     def is_at_rest(self, seconds: float = 0.3) -> bool:
         """Return whether no motor moves for a time [s]."""
         travel = self.travel(lambda: None, seconds)
-        return all(way <= most for way, most in zip(travel, AT_REST, strict=True))
+        return all(distance <= most for distance, most in zip(travel, AT_REST, strict=True))
 
     def fails(self, rule: Rule) -> bool:
         """Return whether the device is in FAULT because of a rule, and nothing moves."""
@@ -336,12 +336,12 @@ class ConformanceRig:
 
     def travel(self, event: Callable[[], object], seconds: float) -> tuple[float, float]:
         """Return the largest distance that the motors move after an event [m], [rad]."""
-        begin, end = self.place, self.runner.now + seconds
+        begin, end = self.positions, self.runner.now + seconds
         farthest = (0.0, 0.0)
         event()
         while self.runner.now < end:
             self.runner.run(PERIOD)
-            here = self.place
+            here = self.positions
             farthest = (
                 max(farthest[0], abs(here[0] - begin[0])),
                 max(farthest[1], abs(here[1] - begin[1])),

@@ -75,7 +75,7 @@ def _stop_by(fault: Fault, rig: ConformanceRig) -> None:
 
 def _later_motion(rig: ConformanceRig) -> Travel:
     """Remove the cause, press, reset and switch on; return how far the motors move."""
-    begin = rig.place
+    begin = rig.positions
     rig.late = 0.0
     for port, drives in rig.drives.connections.items():
         drives.restore(rig.runner.now)
@@ -99,7 +99,7 @@ def no_motion_by_itself(make: MakeRig) -> None:
     The drives are off after set-up and after the driver ends.
     """
     rig = make(drives={"insertion_start": 0.01})
-    begin = rig.place
+    begin = rig.positions
     was_off = False
     while rig.state != "DISABLED":
         rig.runner.run(PERIOD / 4.0)
@@ -137,7 +137,7 @@ def drive_emergency(make: MakeRig) -> None:
     """Reset a drive after a fault: the next step ends at its target."""
     rig = make()
     rig.ready()
-    rig.behind("insertion").fail("insertion", 0x2310)
+    rig.emulator("insertion").fail("insertion", 0x2310)
     assert rig.fails(Rule.DRIVE_EMERGENCY)
     rig.release()
     rig.call("device/reset")
@@ -162,11 +162,11 @@ def quick_stop(make: MakeRig) -> None:
     assert checks.order_directly(make, stops=True) < checks.TIGHT
     rig = make()
     rig.moving(checks.STEP_TIME)
-    rig.behind("insertion").stall("insertion")
+    rig.emulator("insertion").stall("insertion")
     rig.runner.run(0.04)
     rig.release()
-    begin = rig.place
-    rig.behind("insertion").restore(rig.runner.now)
+    begin = rig.positions
+    rig.emulator("insertion").restore(rig.runner.now)
     rig.runner.run(0.5)
     assert rig.distance(begin) == NO_TRAVEL
 
@@ -176,9 +176,9 @@ def retraction(make: MakeRig) -> None:
     rig = make()
     stamp = rig.moving(checks.STEP_TIME)
     rig.until(lambda: stamp in rig.hand.results, "the end of the step")
-    begin = rig.place
+    begin = rig.positions
     rig.call("device/retract")
-    rig.until(lambda: rig.place[0] < begin[0] - 0.0005, "the retraction")
+    rig.until(lambda: rig.positions[0] < begin[0] - 0.0005, "the retraction")
     travel = rig.travel(rig.release, 0.5)
     assert travel[0] < 0.001
     assert rig.is_at_rest()
@@ -187,8 +187,8 @@ def retraction(make: MakeRig) -> None:
     rig.call("device/retract")
     rig.until(lambda: rig.hand.status.activity == "none", "the end of the retraction")
     rig.runner.run(0.5)
-    assert abs(rig.place[0]) < 1e-4
-    assert rig.distance((rig.place[0], begin[1])) == NO_TRAVEL
+    assert abs(rig.positions[0]) < 1e-4
+    assert rig.distance((rig.positions[0], begin[1])) == NO_TRAVEL
 
 
 def unhomed_outward_only(make: MakeRig) -> None:
@@ -196,8 +196,8 @@ def unhomed_outward_only(make: MakeRig) -> None:
     rig = make()
     stamp = rig.moving(checks.STEP_TIME)
     rig.until(lambda: stamp in rig.hand.results, "the end of the step")
-    deep = rig.place[0]
-    rig.behind("insertion").reboot("insertion", rig.runner.now)
+    deep = rig.positions[0]
+    rig.emulator("insertion").reboot("insertion", rig.runner.now)
     rig.runner.run(1.0)
     assert not rig.hand.status.homed
     rig.release()
@@ -209,7 +209,7 @@ def unhomed_outward_only(make: MakeRig) -> None:
     assert rig.is_at_rest()
     rig.call("device/retract")
     rig.until(lambda: rig.hand.status.activity == "none", "the end of the retraction")
-    assert -1e-4 < rig.place[0] < 0.1 * deep
+    assert -1e-4 < rig.positions[0] < 0.1 * deep
 
 
 def homing_time(make: MakeRig) -> None:
@@ -217,7 +217,7 @@ def homing_time(make: MakeRig) -> None:
     rig = make(driver={"max_depth": _SHALLOW}, drives={"insertion_start": _DEEP})
     rig.begin_homing()
     rig.until(lambda: rig.state == "FAULT", "the end of a homing")
-    assert _DEEP - rig.place[0] < 1.25 * _SHALLOW
+    assert _DEEP - rig.positions[0] < 1.25 * _SHALLOW
     assert rig.fails(Rule.HOMING_TIME)
 
 
@@ -227,15 +227,15 @@ def inner_limit_switch(make: MakeRig) -> None:
     rig.moving(checks.STEP_TIME)
     rig.runner.run(1.0)
     assert rig.fails(Rule.INNER_LIMIT_SWITCH)
-    assert rig.place[0] < 0.0015 + 0.0005
+    assert rig.positions[0] < 0.0015 + 0.0005
 
 
 def settling_time(make: MakeRig) -> None:
     """Block the axis shortly before its target: the step ends."""
     rig = make()
     rig.moving(checks.STEP_TIME)
-    rig.until(lambda: rig.place[0] > 0.0018, "the step's end")
-    rig.behind("insertion").stall("insertion")
+    rig.until(lambda: rig.positions[0] > 0.0018, "the step's end")
+    rig.emulator("insertion").stall("insertion")
     rig.runner.run(1.5)
     assert rig.fails(Rule.SETTLING_TIME)
 
@@ -243,7 +243,7 @@ def settling_time(make: MakeRig) -> None:
 def axis_speed(make: MakeRig) -> None:
     """Home with a motor three times as fast as ordered: it stops within 8 mm."""
     rig = make(drives={"insertion_start": _DEEP, "insertion_max_speed": 0.15})
-    motor = rig.behind("insertion").motors["insertion"]
+    motor = rig.emulator("insertion").motors["insertion"]
     follow, last = motor.follow, [motor.position]
 
     def follow_too_fast(demand: float, period: float) -> None:
@@ -254,7 +254,7 @@ def axis_speed(make: MakeRig) -> None:
     rig.begin_homing()
     rig.runner.run(2.0)
     assert rig.fails(Rule.AXIS_SPEED) or rig.fails(Rule.FOLLOWING_ERROR)
-    assert abs(_DEEP - rig.place[0]) < 0.008
+    assert abs(_DEEP - rig.positions[0]) < 0.008
 
 
 def software_limits(make: MakeRig) -> None:
@@ -277,17 +277,17 @@ def one_master(make: MakeRig) -> None:
     """Interfere as another computer at rest: the driver detects it."""
     rig = make()
     rig.ready()
-    begin = rig.place
-    if rig.behind("insertion").intrude():
+    begin = rig.positions
+    if rig.emulator("insertion").intrude():
         assert rig.fails(Rule.ONE_MASTER) or rig.fails(Rule.AXIS_SPEED), rig.logged
-        assert abs(rig.place[0] - begin[0]) < _INTRUSION
+        assert abs(rig.positions[0] - begin[0]) < _INTRUSION
 
 
 def drive_reboot(make: MakeRig) -> None:
     """Restart a drive before the driver misses a reply: it is no longer homed."""
     rig = make(drives={"boot_time": 0.05})
     rig.ready()
-    drives = rig.behind("rotation")
+    drives = rig.emulator("rotation")
     drives.boot_time = 0.05
     drives.reboot("rotation", rig.runner.now)
     rig.runner.run(0.5)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
@@ -13,14 +12,7 @@ from needle_core.can_frame import CanErrors, CanFrame
 from needle_core.errors import UserError
 from needle_core.ports.reopening_port import ReopeningPort
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
-from needle_device_driver.link.slcan_bus import SlcanBus
-from needle_device_driver.link.socketcand_bus import SocketcandBus
-
-SLCAN_BITRATES = (
-    *(10_000, 20_000, 50_000, 83_300, 100_000),
-    *(125_000, 250_000, 500_000, 750_000, 1_000_000),
-)
-"""Bitrates that the slcan protocol supports [bit/s]."""
+from needle_device_driver.link.text_bus import SLCAN_BITRATES, SlcanBus, SocketcandBus, TextBus
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +50,7 @@ class LinkSettings:
         if not self.channel:
             raise UserError(f"channel is empty: name the {self.link} device or interface")
         if self.link == "slcan" and self.bitrate not in SLCAN_BITRATES:
-            known = ", ".join(map(str, SLCAN_BITRATES))
+            known = ", ".join(map(str, sorted(SLCAN_BITRATES)))
             raise UserError(f"bitrate = {self.bitrate} bit/s: slcan has {known}")
 
     @property
@@ -74,9 +66,10 @@ _SILENCE = 0.4
 _MAX_BATCH = 50
 
 Batch = tuple[CanFrame | CanErrors, ...]
+Bus = can.BusABC | TextBus
 
 
-def open_bus(settings: LinkSettings, write_timeout: float) -> can.BusABC:
+def open_bus(settings: LinkSettings, write_timeout: float) -> Bus:
     """Open the adapter; raises the errors of python-can and of the operating system."""
     if settings.link == "slcan":
         return SlcanBus(
@@ -95,7 +88,7 @@ def open_bus(settings: LinkSettings, write_timeout: float) -> can.BusABC:
     return can.Bus(interface=settings.link, channel=settings.channel)
 
 
-class CanPort(ReopeningPort[can.BusABC]):
+class CanPort(ReopeningPort[Bus]):
     """Port on a CAN bus.
 
     Parameters
@@ -121,27 +114,22 @@ class CanPort(ReopeningPort[can.BusABC]):
         self._received_at = 0.0
         self._errors = self._refusals = 0
 
-    def _open_device(self) -> can.BusABC:
+    def _open_device(self) -> Bus:
         bus = open_bus(self._settings, self._write_timeout)
         self._errors = self._refusals = 0
         self._received_at = self._clock()
         return bus
 
-    def _write(self, device: can.BusABC, batch: tuple[CanFrame, ...]) -> None:
+    def _write(self, device: Bus, batch: tuple[CanFrame, ...]) -> None:
         for frame in batch:
             device.send(
                 can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=False)
             )
 
-    def _close_device(self, device: can.BusABC) -> None:
-        # A lost adapter cannot execute the command to close its channel.
-        with contextlib.suppress(can.CanError, OSError):
-            device.shutdown()
-        if isinstance(device, SlcanBus):
-            # If that command fails, python-can leaves the serial port open.
-            device.serialPortOrig.close()
+    def _close_device(self, device: Bus) -> None:
+        device.shutdown()
 
-    def _read(self, device: can.BusABC) -> Batch:
+    def _read(self, device: Bus) -> Batch:
         batch = self._receive(device)
         if batch:
             self._received_at = self._clock()
@@ -151,7 +139,7 @@ class CanPort(ReopeningPort[can.BusABC]):
                 device.set_up_channel()
         return batch
 
-    def _receive(self, bus: can.BusABC) -> Batch:
+    def _receive(self, bus: Bus) -> Batch:
         items: list[CanFrame | CanErrors] = []
         message, error_frames = bus.recv(_RECEIVE_TIMEOUT), 0
         while message is not None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 
 from needle_device_driver.axes.axis import PERIOD, AxisSnapshot
-from needle_device_driver.axes.axis_settings import HERE, AxisSettings
+from needle_device_driver.axes.axis_settings import PRESENT_POSITION_METHODS, AxisSettings
 from needle_device_driver.axes.drives import CyclicAxis, Fault
 from needle_device_driver.axes.link import DriveError, raised_as_axis_error
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
@@ -274,7 +274,7 @@ class PolledAxis(CyclicAxis):
 
     def _advance_homing(self) -> None:
         settings, at = self._settings, self._at
-        if settings.homing_method in HERE:
+        if settings.homing_method in PRESENT_POSITION_METHODS:
             self._count_from_home(at.position)
             return
         if self._homing is _Homing.SEARCH and at.home_switch:

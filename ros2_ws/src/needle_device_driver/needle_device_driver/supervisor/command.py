@@ -225,7 +225,7 @@ def _check_bounds(
     rate = max((piece.turn - turn_slack) / piece.leg.duration for piece in path)
     turns = max(abs(piece.leg.rotation) for piece in path) / (2 * math.pi)
     mm = 1e3
-    for rule, name, value, bound, room, unit in (
+    for rule, name, value, bound, tolerance, unit in (
         (Rule.MAX_DEPTH, "depth", end * mm, limits.max_depth * mm, 0.0, "mm"),
         (Rule.MAX_STEP_LENGTH, "step", length * mm, limits.max_step_length * mm, slack * mm, "mm"),
         (Rule.MAX_SPEED, "speed", speed * mm, limits.max_speed * mm, 0.0, "mm/s"),
@@ -233,7 +233,7 @@ def _check_bounds(
         (Rule.MAX_ROTATION_RATE, "rotation rate", rate, limits.max_rotation_rate, 0.0, "rad/s"),
         (Rule.MAX_TURNS, "accumulated rotation", turns, limits.max_turns, 0.0, "turns"),
     ):
-        if value > (bound + room) * _ROUNDING:
+        if value > (bound + tolerance) * _ROUNDING:
             return Refusal(rule, f"{name} {value:.6g} {unit} is beyond {bound:.6g} {unit}")
     return None
 

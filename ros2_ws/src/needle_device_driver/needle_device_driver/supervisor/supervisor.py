@@ -330,8 +330,8 @@ class MotionSupervisor:
             self._core.watchdog_trips += 1
             self._core.abort(text)
 
-    def _wrong_state(self, wanted: State) -> ServiceResult:
-        return ServiceResult(False, f"the device is {self._core.state.value}, not {wanted.value}")
+    def _wrong_state(self, expected: State) -> ServiceResult:
+        return ServiceResult(False, f"the device is {self._core.state.value}, not {expected.value}")
 
     def _disable(self) -> ServiceResult:
         self._hold.require_new_press()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from needle_device_driver.axes.motion import CoordinatedMotion, Leg, SetPoint, slowed_legs
+from needle_device_driver.axes.motion import CoordinatedMotion, Leg
 
 _places = st.tuples(st.floats(-0.2, 0.2), st.floats(-60.0, 60.0))
 
@@ -24,18 +23,6 @@ def test_last_set_point_is_exactly_the_target(
     while not motion.complete:
         set_point = motion.advance(0.02, 1.0)
     assert (set_point.insertion, set_point.rotation) == end
-
-
-def test_half_speed_covers_half_the_distance() -> None:
-    motion = CoordinatedMotion((0.0, 0.0), [Leg(1.0, -2.0, 1.0), Leg(2.0, -2.0, 0.5)])
-    assert motion.advance(0.2, 1.0) == SetPoint(0.2, -0.4, 1.0, 2.0)
-    at = motion.advance(0.2, 0.5)
-    assert dataclasses.astuple(at) == pytest.approx((0.3, -0.6, 0.5, 1.0))
-    at = motion.advance(0.8, 1.0)
-    assert dataclasses.astuple(at) == pytest.approx((1.2, -2.0, 0.9 / 0.8, 1.4 / 0.8))
-    assert not motion.complete
-    motion.advance(0.4, 1.0)
-    assert motion.complete
 
 
 def test_rest_of_a_period_uses_the_speed_of_the_next_leg() -> None:
@@ -57,11 +44,3 @@ def test_rotation_follows_a_pushed_needle_at_its_rate() -> None:
     assert [motion.rotation_at(hand) for hand, _ in wanted] == [rotation for _, rotation in wanted]
     assert motion.follow(3.0, 10.0, 0.5).rotation == 0.0
     assert motion.complete
-
-
-def test_legs_are_slowed_to_both_bounds() -> None:
-    legs = [Leg(1.0, 1.0, 1.0), Leg(1.5, -3.0, 1.0), Leg(1.6, -3.0, 9.0)]
-    slowed = slowed_legs((0.0, 0.0), legs, max_speed=0.25, max_rotation_rate=2.0)
-    assert [leg.duration for leg in slowed] == [4.0, 2.0, 9.0]
-    slowed = slowed_legs((0.0, 0.0), legs[1:], max_speed=0.25)
-    assert [leg.duration for leg in slowed] == [6.0, 9.0]

@@ -221,9 +221,6 @@ def test_a_device_without_encoder_and_sensors_counts_its_steps(lack: str | None)
     ("flag", "status", "powered", "fault", "rebooted"),
     [
         ("--", "BUSY", True, "", False),
-        ("NI", "BUSY", True, "", False),
-        ("WL", "IDLE", True, "", False),
-        ("WH", "IDLE", True, "", False),
         ("WR", "IDLE", True, "", True),
         ("FO", "IDLE", False, "", False),
         ("FS", "IDLE", True, "stalled and stopped (FS)", False),
@@ -265,17 +262,6 @@ def test_switches_follow_their_requests() -> None:
             )
     reply = line.statuses[1][1]["insertion"]
     assert (reply.home_switch, reply.inner_switch) == (False, True)
-
-
-def test_late_replies_carry_their_own_number() -> None:
-    line = Line().ready()
-    line.protocol.request(4)
-    line.protocol.request(5)
-    line.answer(4)
-    assert [number for number, _ in line.statuses] == [4]
-    line.answer(5)
-    line.answer(5)
-    assert [number for number, _ in line.statuses] == [4, 5]
 
 
 COMPLETE = (

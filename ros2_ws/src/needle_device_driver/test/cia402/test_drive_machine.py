@@ -57,13 +57,6 @@ def test_no_command_after_a_quick_stop_before_the_axis_rests(
     assert machine.target == 1009
 
 
-def test_stop_while_switching_off_ends_off(machine: DriveMachine) -> None:
-    enabled(machine)
-    machine.set_goal(Goal.OFF)
-    machine.stop()
-    assert orders(machine, *[said(QUICK_STOP)] * 4)[-1] is DriveCommand.DISABLE_VOLTAGE
-
-
 def test_stop_is_repeated_until_the_drive_confirms_it(machine: DriveMachine) -> None:
     enabled(machine)
     machine.stop()
@@ -165,23 +158,19 @@ def test_fault_is_not_acknowledged_and_unknown_statusword_is_a_problem(
     assert (machine.problem, machine.target, machine.switching) == ("", 7, False)
 
 
-def test_time_limit_of_a_drive_that_leaves_its_mode(
-    machine: DriveMachine,
-) -> None:
-    enabled(machine)
-    orders(machine, *[said(ENABLED, mode=6)] * 100)
-    assert machine.problem == ""
-    machine.update(said(ENABLED, mode=6))
-    assert machine.problem == "is not on after 2 s: OPERATION_ENABLED, mode 6"
-
-
-@pytest.mark.parametrize(("statusword", "told"), [(0x0250, False), (0x0050, True)])
-def test_drive_without_remote_bit_is_reported(
-    machine: DriveMachine, statusword: int, told: bool
+@pytest.mark.parametrize(
+    ("statusword", "mode", "text"),
+    [
+        (ENABLED, 6, "OPERATION_ENABLED, mode 6"),
+        (DISABLED, 8, "SWITCH_ON_DISABLED, mode 8"),
+        (0x0050, 8, "SWITCH_ON_DISABLED, mode 8, not under remote control (bit 9)"),
+    ],
+)
+def test_drive_that_is_not_on_after_two_seconds_is_reported(
+    machine: DriveMachine, statusword: int, mode: int, text: str
 ) -> None:
     machine.set_goal(Goal.ON)
-    orders(machine, *[said(statusword)] * 100)
+    orders(machine, *[said(statusword, mode=mode)] * 100)
     assert machine.problem == ""
-    machine.update(said(statusword))
-    assert "is not on after 2 s: SWITCH_ON_DISABLED, mode 8" in machine.problem
-    assert ("not under remote control (bit 9)" in machine.problem) is told
+    machine.update(said(statusword, mode=mode))
+    assert machine.problem == f"is not on after 2 s: {text}"

@@ -14,13 +14,14 @@ from typing import Any
 
 import can
 import pytest
+from can.interfaces.slcan import slcanBus
 
 from needle_core.can_frame import CanErrors, CanFrame
 from needle_core.component import PortChange
 from needle_core.ports import reopening_port
-from needle_device_driver.link import can_port, socketcand_bus
-from needle_device_driver.link.can_port import SLCAN_BITRATES, Batch, CanPort, LinkSettings
-from needle_device_driver.link.slcan_bus import SlcanBus
+from needle_device_driver.link import can_port, text_bus
+from needle_device_driver.link.can_port import Batch, CanPort, LinkSettings
+from needle_device_driver.link.text_bus import SLCAN_BITRATES
 
 PORTS: list[CanPort] = []
 CONNECT = socket.create_connection
@@ -72,7 +73,7 @@ class Port:
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(reopening_port, "_REOPEN_PERIOD", 0.0)
-    monkeypatch.setattr(socketcand_bus, "_REPLY_TIMEOUT", 0.05)
+    monkeypatch.setattr(text_bus, "_REPLY_TIMEOUT", 0.05)
     yield
     while PORTS:
         PORTS.pop().close()
@@ -109,10 +110,11 @@ def adapter() -> Iterator[Adapter]:
 
 
 def test_slcan_opens_with_the_bitrate_sends_frames_and_closes(adapter: Adapter) -> None:
-    assert set(SLCAN_BITRATES) == set(SlcanBus._BITRATES)
+    codes = {rate: f"S{code}" for code, rate in enumerate(SLCAN_BITRATES)}
+    assert codes == slcanBus._BITRATES
     port = Port("slcan", adapter.path, bitrate=1_000_000)
     # First it ends a line of an earlier program.
-    assert adapter.read(b"O\r") == b"\rC\rS8\r\rO\r"
+    assert adapter.read(b"O\r") == b"\rC\rS8\rO\r"
     port.send(0x201, b"\x0f\x00\x08")
     port.send(0x80)
     assert adapter.read(b"t0800\r") == b"t20130F0008\rt0800\r"
@@ -181,12 +183,12 @@ def test_slcan_receives_frames_in_any_pieces(adapter: Adapter) -> None:
 def test_slcan_sets_up_a_silent_adapter_again(adapter: Adapter) -> None:
     # The adapter restarts when its port is opened.
     port = Port("slcan", adapter.path, bitrate=125_000)
-    assert adapter.read(b"O\r") == b"\rC\rS4\r\rO\r"
+    assert adapter.read(b"O\r") == b"\rC\rS4\rO\r"
     port.now = 0.4
     port.port.step()
     port.now = 0.41
     port.port.step()
-    assert adapter.read(b"O\r") == b"\rC\rS4\r\rO\r"
+    assert adapter.read(b"O\r") == b"\rC\rS4\rO\r"
     port.now = 0.8
     adapter.say(b"t1810\r")
     port.until(lambda: port.frames == [b""])
@@ -286,7 +288,7 @@ def test_socketcand_passes_frames_and_detects_a_closed_connection(
     port.until(lambda: port.frames == [b"\x37\x02"])
     daemon.peer.close()
     # Detected without sending.
-    port.until(lambda: "the server closed the connection" in port.changes)
+    port.until(lambda: "closed by the other end" in port.changes)
     daemon.close()
     daemon = Daemon(monkeypatch)
     port = Port("socketcand")

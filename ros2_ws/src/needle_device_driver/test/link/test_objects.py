@@ -61,10 +61,7 @@ def test_reverse_drive_swaps_its_limits() -> None:
 
 def test_invalid_settings_and_parameters_are_refused() -> None:
     values: list[dict[str, Any]] = [
-        {"counts_per_unit": 0.0},
-        {"counts_per_unit": math.nan},
-        {"speed": -1.0},
-        {"quick_stop_deceleration": math.inf},
+        *({name: 0.0} for name in ("counts_per_unit", "speed", "quick_stop_deceleration")),
         {"lower": 0.201},
         *({"node_id": node_id} for node_id in (0, 127)),
         *({"homing_method": method} for method in (0, 15, 16, 31, 36, 38)),

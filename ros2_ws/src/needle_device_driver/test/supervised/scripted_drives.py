@@ -258,14 +258,12 @@ class ScriptedBus:
         self.sent: list[tuple[int, bytes]] = []
         # Whether answers wait for the next `flush`.
         self.late = False
-        self.cut = False
 
     def send(self, cob_id: int, data: bytes) -> None:
         self.sending()
         self.sent.append((cob_id, data))
         for drive in self.drives:
-            if not self.cut:
-                drive.take(cob_id, data)
+            drive.take(cob_id, data)
         if not self.late:
             self.flush()
 
@@ -274,8 +272,7 @@ class ScriptedBus:
             out = list(drive.out)
             drive.out.clear()
             for cob_id, data in out:
-                if not self.cut:
-                    self.put(cob_id, data)
+                self.put(cob_id, data)
 
     def put(self, cob_id: int, data: bytes) -> None:
         self.receive(CanFrame(cob_id, data))

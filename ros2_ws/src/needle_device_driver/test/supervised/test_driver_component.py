@@ -56,7 +56,7 @@ def test_search_waits_for_the_discovery_of_other_devices() -> None:
 
 def test_driver_waits_for_missing_drives_and_exits_on_refusal() -> None:
     rig = ConformanceRig(1, driver={"connect_timeout": 3.0})
-    rig.behind("rotation").hang("rotation")
+    rig.emulator("rotation").hang("rotation")
     rig.runner.run(3.0)
     assert "rotation axis: node 2 does not answer" in answer(rig, "home")
     assert len(rig.logged) == 1, "said once"
@@ -64,7 +64,7 @@ def test_driver_waits_for_missing_drives_and_exits_on_refusal() -> None:
     (leave,) = rig.runner.exits.values()
     assert (leave.code, "node 2 does not answer" in leave.text) == (2, True)
     rig = ConformanceRig(1)
-    objects = rig.behind("insertion").drives["insertion"]._objects
+    objects = rig.emulator("insertion").drives["insertion"]._objects
     del objects._entries[0x605A, 0]
     objects._indices.discard(0x605A)
     rig.runner.run(1.0)
@@ -74,7 +74,7 @@ def test_driver_waits_for_missing_drives_and_exits_on_refusal() -> None:
 
 def test_second_master_is_forgotten_when_the_link_is_reopened() -> None:
     rig = ConformanceRig(1)
-    rig.behind("rotation").hang("rotation")
+    rig.emulator("rotation").hang("rotation")
     rig.runner.run(0.2)
     (drives,) = rig.driver.drives
     drives.receive((CanFrame(0x000, b"\x01\x00"),))
@@ -82,7 +82,7 @@ def test_second_master_is_forgotten_when_the_link_is_reopened() -> None:
     rig.runner.run(0.1)
     assert drives.health("").message == "link virtual can is lost: unplugged"
     rig.runner.open_port(DRIVER, "can")
-    rig.behind("rotation").restore(rig.runner.now)
+    rig.emulator("rotation").restore(rig.runner.now)
     rig.start()
     assert rig.hand.status.fault == ""
 
@@ -92,7 +92,7 @@ def test_slow_procedure_is_cancelled(how: str) -> None:
     rig = ConformanceRig(1)
     rig.start()
     rig.call("device/confirm_needle_out", True)
-    rig.behind("rotation").hang("rotation")
+    rig.emulator("rotation").hang("rotation")
     rig.hand.answers.clear()
     rig.hand.actions.append(Call("device/home"))
     rig.runner.run(0.05)

@@ -49,9 +49,8 @@ def test_drive_has_half_a_second_to_display_an_unlisted_mode(seconds: float, has
 @pytest.mark.parametrize(
     ("parameter", "index", "wanted", "least", "most"),
     [
+        ({}, 0x6085, 10**7, 5_000_001, 2 * 10**7),
         ({"insertion_following_error": 0.0005}, 0x6065, 10_000, 5001, 10_000),
-        ({"insertion_following_error": 0.0005001}, 0x6065, 10_002, 5002, 10_002),
-        ({"insertion_max_torque": 0.8}, 0x6072, 800, 401, 1600),
         ({"insertion_max_torque": 0.802}, 0x6072, 802, 402, 1604),
     ],
 )

@@ -116,8 +116,9 @@ def test_retraction_ignores_inner_switch_and_rotation() -> None:
     bench = inserted()
     bench.insertion.inner_switch = True
     assert bench.retract().success
+    bench.go()
     bench.rotation.position += 1.0
-    bench.go(10)
+    bench.go(9)
     assert bench.activity == "retraction"
     bench.insertion.position += 0.00051
     bench.go()

@@ -266,8 +266,11 @@ def test_hold_to_run_without_hold_a_push_turns_nothing() -> None:
     path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
     bench.go()
     push(bench, 1e-4)
-    bench.hold(False)
     turned = bench.positions[1]
+    bench.insertion.position += 1e-4
+    bench.go(2, scale=0.0)
+    assert bench.positions[1] == turned
+    bench.hold(False)
     bench.insertion.position += 5e-4
     bench.wait(5)
     assert turned == pytest.approx(0.05)
