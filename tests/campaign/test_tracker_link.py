@@ -31,7 +31,7 @@ def opened(port: TransformPort) -> Iterator[list[Any]]:
 
 
 def transform_of(arrived: list[Any], sender: Any) -> LinkMessage:
-    """Send a transform by a pyigtl server or client until the port receives it; return it."""
+    """Send a transform from a pyigtl server or client until the port receives it; return it."""
     stream, deadline = LinkStream("TRANSFORM"), time.monotonic() + LIMIT
     pose, read = np.diag([1.0, -1.0, -1.0, 1.0]), 0
     while True:

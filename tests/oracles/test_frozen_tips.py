@@ -1,6 +1,6 @@
 """Pairs of the frozen run at level camera, rendered again: the tracker finds the frozen tips.
 
-Joints determine the needle, and pose, seed and number of an exposure determine its images.
+The joints determine the needle; pose, seed and number of an exposure determine its images.
 """
 
 from __future__ import annotations

@@ -16,11 +16,11 @@ FROZEN = json.loads((Path(__file__).resolve().parent / "topics.json").read_text(
 GONE = {
     "/clock": "the runner's time is no message: log times are virtual",
     "/device_driver/transition_event": "a component has no lifecycle of ROS",
-    "/parameter_events": "parameters are fixed, and stand in the bag's metadata",
+    "/parameter_events": "parameters are fixed, and are in the bag's metadata",
 }
 """Frozen topics that a virtual run lacks, and the reasons."""
 ADDED = {
-    "/stereo_tracker/annotated_image": "every output is announced; nobody looks: it stays empty",
+    "/stereo_tracker/annotated_image": "an output that stays empty without a subscriber",
     "/needle/proposed_target": "the controller receives it; no planner proposes a target",
     "/needle/planned_path": "the controller plans a path past obstacles only",
 }

@@ -56,7 +56,7 @@ _SPACING = 6e-5
 _LOOPBACK = "127.0.0.1"
 STAGES = ("tracker", "controller", "driver", "image to set-point")
 _IMAGES_FILE, _INSERTIONS_FILE = "images.npy", "insertions.npy"
-# Jitter of the exposures, so that they do not synchronise with the driver's cycles [s].
+# Jitter of the exposures, so that they do not synchronize with the driver's cycles [s].
 _JITTER = 0.01
 # Time from exposure to the arrival of both images in the computer, as with a USB 3 camera [s].
 _TRANSFER = 0.01

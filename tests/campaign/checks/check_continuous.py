@@ -9,14 +9,21 @@ import numpy as np
 
 from campaign.checking import Check, Finding, Workbench
 from campaign.checks.control_studies import Study, run
-from campaign.trials.steered_needle import Hand, changing, constant, pushing, rms_at_end, steer
+from campaign.trials.steered_needle import (
+    Hand,
+    changing,
+    constant_speed,
+    pushing,
+    rms_at_end,
+    steer,
+)
 from needle_device_driver.conformance.rig import FASTEST
 
 SEED, NEEDLES = 1400, 12
 HANDS: dict[str, tuple[float, Callable[[np.random.Generator], Hand]]] = {
-    "0.5 mm/s": (0.06, lambda _: constant(0.0005)),
-    "2 mm/s": (0.06, lambda _: constant(0.002)),
-    "5 mm/s": (0.06, lambda _: constant(FASTEST)),
+    "0.5 mm/s": (0.06, lambda _: constant_speed(0.0005)),
+    "2 mm/s": (0.06, lambda _: constant_speed(0.002)),
+    "5 mm/s": (0.06, lambda _: constant_speed(FASTEST)),
     "0 to 5 mm/s, stops, releases": (0.06, changing),
     "pushed, jerks to 20 mm/s": (0.25, pushing),
 }

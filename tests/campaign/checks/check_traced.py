@@ -40,7 +40,7 @@ def path_traced(_: Workbench) -> Iterator[Finding]:
     for rig in RIGS:
         yield from _errors(rig, [look for look in needles if look.scene.rig == rig])
     tips = [look for look in needles if look.tip is not None]
-    inside = float(np.mean([look.normalised <= _CHI_SQUARED_95 for look in tips]))
+    inside = float(np.mean([look.normalized <= _CHI_SQUARED_95 for look in tips]))
     what = f"path-traced: {len(tips)} tips within the 95 % ellipsoid that they claim"
     passed = 0.85 <= inside <= 0.995
     yield Finding("path_traced_consistency", what, "85 to 99.5 %", f"{inside:.1%}", passed)
@@ -62,7 +62,7 @@ def path_traced_variations(_: Workbench) -> Iterator[Finding]:
         ]
         tips = [look for look in looks if look.tip is not None]
         found, median = _found(looks), 1e3 * float(np.median([look.error for look in tips]))
-        inside = float(np.mean([look.normalised <= _CHI_SQUARED_95 for look in tips]))
+        inside = float(np.mean([look.normalized <= _CHI_SQUARED_95 for look in tips]))
         wrong = sum(look.error > WRONG for look in tips)
         yield Finding(
             "path_traced_" + variation.name.replace(" ", "_"),

@@ -137,11 +137,11 @@ def _errors(
 
 
 def _consistency(key: str, runs: Sequence[TrackedRun]) -> Iterator[Finding]:
-    squares = np.concatenate([run.normalised[run.found] for run in runs])
+    squares = np.concatenate([run.normalized[run.found] for run in runs])
     inside, mean = float(np.mean(squares <= _QUANTILE_95)), float(squares.mean())
     yield Finding(
         f"{key}_consistency",
-        f"{key}: normalised error squared (3 when the covariance fits)",
+        f"{key}: normalized error squared (3 when the covariance fits)",
         f"mean <= {_MOST_MEAN:g}, >= {_LEAST_INSIDE:.0%} within the 95 % bound",
         f"mean {mean:.2f}, {inside:.1%} within",
         mean <= _MOST_MEAN and inside >= _LEAST_INSIDE,

@@ -34,7 +34,7 @@ spin = lambda node, end: 7
 sys.exit(run_node(node, help_text="", parameters=object, args=["one"], spin=spin))
 """
     with reserve_domain_id() as domain:
-        # Port of user data; the one before belongs to discovery.
+        # Port of user data; the preceding port is for discovery.
         port = ports_of(domain)[FIRST_PARTICIPANT + 1]
         (SHARED_MEMORY / f"fastrtps_port{port}").write_bytes(b"")
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}

@@ -113,7 +113,7 @@ class TrackedPair:
         return float(np.linalg.norm(self._off))
 
     @property
-    def normalised(self) -> float:
+    def normalized(self) -> float:
         """Squared error over its covariance."""
         assert self.tip is not None
         return float(self._off @ np.linalg.solve(self.tip.covariance, self._off))

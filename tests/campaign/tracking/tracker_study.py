@@ -115,7 +115,7 @@ class TrackedRun:
     ----------
     errors : ndarray, shape (n, 3)
         Tip less truth in `rig` [m]; NaN where there is no tip.
-    normalised : ndarray, shape (n,)
+    normalized : ndarray, shape (n,)
         Squared error over its covariance; NaN where there is no tip.
     states : list of TrackState
         State after each pair.
@@ -126,7 +126,7 @@ class TrackedRun:
     """
 
     errors: Array
-    normalised: Array
+    normalized: Array
     states: list[TrackState]
     visible: NDArray[np.bool_]
     seconds: Array
@@ -134,7 +134,7 @@ class TrackedRun:
     @property
     def found(self) -> NDArray[np.bool_]:
         """Whether there is a tip, for each exposure."""
-        return np.asarray(np.isfinite(self.normalised))
+        return np.asarray(np.isfinite(self.normalized))
 
     @property
     def distances(self) -> Array:
@@ -178,7 +178,7 @@ def track_run(
         Whether the tracker is reset before every pair.
     """
     tracker.reset()
-    errors, normalised, states, visible, seconds = [], [], [], [], []
+    errors, normalized, states, visible, seconds = [], [], [], [], []
     for exposure in exposures:
         if searching:
             tracker.reset()
@@ -193,9 +193,9 @@ def track_run(
             error = measured.tip.position - exposure.T_rig_tip[:3, 3]
             square = float(error @ np.linalg.solve(measured.tip.covariance, error))
         errors.append(error)
-        normalised.append(square)
+        normalized.append(square)
     return TrackedRun(
-        np.array(errors), np.array(normalised), states, np.array(visible), np.array(seconds)
+        np.array(errors), np.array(normalized), states, np.array(visible), np.array(seconds)
     )
 
 

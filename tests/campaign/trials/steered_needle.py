@@ -125,7 +125,7 @@ def rms_at_end(path: np.ndarray, length: float = 0.02) -> float:
 # ---- hands --------------------------------------------------------------------------------------
 
 
-def constant(speed: float) -> Hand:
+def constant_speed(speed: float) -> Hand:
     """Return a hand that holds at a speed [m/s]."""
     return lambda _: HandState(True, speed / FASTEST)
 

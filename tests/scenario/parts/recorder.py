@@ -64,7 +64,7 @@ class Disk:
         elif fault.kind is Kind.SLOW:
             self.slowness = fault.size * _SLOWEST_JOB
         elif fault.kind is Kind.OFF and fault.size < 0.5:
-            # Others fill the disk: the reported free space shows it.
+            # Other programs fill the disk, so that no free space is reported.
             self.free = 0
         else:
             self.error = errno.EIO if fault.kind is Kind.GARBAGE else errno.ENOSPC

@@ -105,7 +105,7 @@ class TrackedRig:
         exits = self.runner.exits
         return exits[OPERATOR].code if OPERATOR in exits else None
 
-    def normalised_errors(self) -> tuple[np.ndarray, np.ndarray]:
+    def normalized_errors(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the squared errors of position and heading over their claimed covariances."""
         times = np.array(sorted(self.tracker.truth))
         errors = []
@@ -148,7 +148,7 @@ def test_a_tracker_steers_the_needle_into_the_plane(case: str) -> None:
     rig = TrackedRig(SimulatedTracker(model, 1), registration, **settings)
     assert rig.run(400.0) == EXIT_DONE
     assert abs(rig.tracker.bench.tip[0] - rig.target) < 1e-3
-    of_position, of_heading = rig.normalised_errors()
+    of_position, of_heading = rig.normalized_errors()
     # Mean of chi-squared with three and two degrees of freedom, 1 by 1.
     assert 0.7 < np.mean(of_position) / 3.0 < 1.1
     assert 0.7 < np.mean(of_heading) / 2.0 < 1.2

@@ -1,4 +1,4 @@
-"""`ros2 run needle_bringup commission`: measure on a real bench how far each stop takes."""
+"""`ros2 run needle_bringup commission`: measure the distance of each kind of stop on a bench."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Diagnostics as data, and sanitised text of other nodes for logs and messages."""
+"""Diagnostics as data, and sanitized text of other nodes for logs and messages."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def sanitize(text: str, max_length: int = 64) -> str:
     Parameters
     ----------
     text : str
-        Text to sanitise.
+        Text to sanitize.
     max_length : int
         Maximum number of characters; `...` replaces the rest.
 
@@ -62,7 +62,7 @@ def sanitize_list(names: Sequence[str], max_count: int = 4) -> str:
     Parameters
     ----------
     names : sequence of str
-        Names to sanitise.
+        Names to sanitize.
     max_count : int
         Maximum number of names; the rest is counted.
     """

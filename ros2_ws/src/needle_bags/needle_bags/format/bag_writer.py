@@ -105,7 +105,7 @@ class BagWriter:
     def write(
         self, topic: str, data: bytes, log_time: int, publish_time: int, sequence: int = 0
     ) -> None:
-        """Append a serialised message.
+        """Append a serialized message.
 
         Parameters
         ----------

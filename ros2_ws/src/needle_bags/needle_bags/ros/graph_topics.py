@@ -1,4 +1,4 @@
-"""Subscriptions to selected topics of the graph, with serialised messages."""
+"""Subscriptions to selected topics of the graph, with serialized messages."""
 
 from __future__ import annotations
 

@@ -21,7 +21,8 @@ class ShaftTrail:
     Parameters
     ----------
     start : ndarray, optional
-        Pose of the origin, shape (4, 4), for a path of poses; by default the path has positions.
+        Pose of the origin, shape (4, 4), to store a path of poses; by default the path stores
+        positions.
     """
 
     def __init__(self, start: Array | None = None) -> None:

@@ -83,7 +83,7 @@ def monte_carlo(options: MonteCarloOptions) -> int:
     result = {**results.figures, "cpu_s": worked, "wall_s": wall}
     print(describe(result))
     if options.csv is not None:
-        write_csv(options.csv, results.columns, options.of_a_run)
+        write_csv(options.csv, results.columns, options.run_options)
     if options.json is not None:
         names = ("controller", "estimator", "law", "planner", "grid", "seed")
         asked: dict[str, JsonValue] = {name: getattr(options, name) for name in names}

@@ -68,7 +68,7 @@ exit codes: 0 done; 2 invalid or missing input; 130 interrupted
 
 _DEPTH_MM, _DEPTH_OF_POINTS_MM = "120", "150"
 # Options of the study that are not options of each run.
-_OF_THE_STUDY = (
+_STUDY_OPTIONS = (
     "grid", "draws", "x_mm", "pitch_deg", "roll_deg", "initial", "targets",
     "scheduler", "json", "csv",
 )  # fmt: skip
@@ -78,7 +78,7 @@ _OF_THE_STUDY = (
 class MonteCarloOptions:
     """Options of a study, in SI units.
 
-    `of_a_run` contains the options of each run except its start and target point, as typed.
+    `run_options` contains the options of each run except its start and target point, as typed.
     """
 
     controller: str
@@ -104,7 +104,7 @@ class MonteCarloOptions:
     scheduler: str
     json: Path | None
     csv: Path | None
-    of_a_run: Mapping[str, str]
+    run_options: Mapping[str, str]
 
 
 def parse(arguments: Sequence[str]) -> MonteCarloOptions:
@@ -156,17 +156,17 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         scheduler=given.scheduler,
         json=output_file("--json", given.json),
         csv=output_file("--csv", given.csv),
-        of_a_run=_of_a_run({**vars(given), "depth_mm": depth}),
+        run_options=_run_options({**vars(given), "depth_mm": depth}),
     )
 
 
-def _of_a_run(given: Mapping[str, str]) -> Mapping[str, str]:
+def _run_options(given: Mapping[str, str]) -> Mapping[str, str]:
     """Return the options of every run; `rotation_deg` is renamed, as a result has this name."""
     renamed = {"rotation_deg": "most_rotation_deg"}
     return {
         renamed.get(name, name): value or ""
         for name, value in given.items()
-        if name not in _OF_THE_STUDY
+        if name not in _STUDY_OPTIONS
     }
 
 

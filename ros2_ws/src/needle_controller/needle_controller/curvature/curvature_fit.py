@@ -294,7 +294,7 @@ def _length(bend: Array, covariance: Array) -> tuple[Array, Array]:
 def circle_curvature(tips: npt.ArrayLike) -> Array:
     """Return the curvature of the plain least-squares circle ([KC09] IV-B), for comparison.
 
-    The plane is that of the two largest principal axes; the circle minimises the sum of (|p - c|^2
+    The plane is that of the two largest principal axes; the circle minimizes the sum of (|p - c|^2
     - r^2)^2. The result is biased, because noise along a short arc looks like curvature: with +-1
     mm of noise on 60 mm, it is a quarter too large. Use `fit_curvature`.
 

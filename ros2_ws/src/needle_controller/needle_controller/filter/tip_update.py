@@ -73,7 +73,7 @@ class Workspace(NamedTuple):
 
 @compiled
 def new_workspace() -> Workspace:
-    """Return uninitialised working memory."""
+    """Return uninitialized working memory."""
     return Workspace(
         np.empty((3, ERROR)),
         np.empty(3),
@@ -85,7 +85,7 @@ def new_workspace() -> Workspace:
 
 @compiled
 def new_reading() -> Reading:
-    """Return an uninitialised reading."""
+    """Return an uninitialized reading."""
     tip, values, bounds = np.empty(3), np.empty(3), np.empty(3)
     return Reading(tip, np.empty((3, 3)), np.empty(4), np.empty((3, 3)), values, bounds)
 

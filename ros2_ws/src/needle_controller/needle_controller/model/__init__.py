@@ -1,1 +1,1 @@
-"""The model of the needle: kinematics, its linearisation, gains, reach, and the plane to follow."""
+"""The model of the needle: kinematics, its linearization, gains, reach, and the plane to follow."""

@@ -1,4 +1,4 @@
-"""The needle's generalised coordinates ([KC09] (3)) and its orientation.
+"""The needle's generalized coordinates ([KC09] (3)) and its orientation.
 
 Paper symbols: q = (x, y, z, alpha, beta, gamma) are the coordinates (tip position, yaw, pitch,
 roll), r = (x, beta, gamma) the reduced state. All are in the frame `target_plane`, whose y-z plane

@@ -136,7 +136,7 @@ class PathEvaluation(NamedTuple):
         Sum of violated constraints on clearance, goal tolerance and lengths; 0 for a path that may
         be followed.
     cost : float
-        Cost to be minimised.
+        Cost to be minimized.
     """
 
     length: float

@@ -1,8 +1,8 @@
-"""Search for a path: an evolution strategy optimises its via points.
+"""Search for a path: an evolution strategy optimizes its via points.
 
 A path is a chain of legs (`legs`) over m via points to the target. MA-ES (H.-G. Beyer, B. Sendhoff,
 "Simplify your covariance matrix adaptation evolution strategy", IEEE Trans. Evolutionary
-Computation 21(5), 2017) minimises its cost J (`path_evaluation`) over x, the 3 m coordinates of the
+Computation 21(5), 2017) minimizes its cost J (`path_evaluation`) over x, the 3 m coordinates of the
 via points, with its default constants and without derivatives:
 
     z_k ~ N(0, I),  d_k = M z_k,  x_k = y + sigma d_k,  k = 1 .. lambda, sorted by cost
@@ -81,7 +81,7 @@ def initial_legs(tip: Array, target: Array, number: int) -> tuple[Array, Array]:
 
 @compiled
 def optimize_legs(legs: Array, problem: PathProblem, draws: Array) -> PathEvaluation:
-    """Optimise the via points of a path; return its evaluation.
+    """Optimize the via points of a path; return its evaluation.
 
     Parameters
     ----------

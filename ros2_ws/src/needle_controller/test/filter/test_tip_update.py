@@ -92,7 +92,7 @@ def test_truncated_moments_equal_scipys(lower: float, upper: float) -> None:
 
 
 def test_uniform_noise_gives_the_posteriors_moments() -> None:
-    """Against samples of the prior inside the box; one coordinate is measured."""
+    """Compare with samples of the prior inside the noise box; one coordinate is measured."""
     rng = np.random.default_rng(4)
     covariance = np.zeros((ERROR, ERROR))
     used = [0, 4, E_KAPPA, E_SCALE]

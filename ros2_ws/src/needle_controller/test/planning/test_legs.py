@@ -1,4 +1,4 @@
-"""Legs: the advance against scipy's exponential, aims, misses, truncation."""
+"""Legs: advance compared with scipy's exponential, aiming, miss distance, truncation."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def test_without_hold_no_tip_is_used_and_after_it_a_fresh_one() -> None:
         assert rig.steering.on_device(HOLD) == []
         assert state_of(rig) == (STEERING, Awaiting.TIP)
         assert rig.steering.tips.after_ns == rig.now
-        # A step waits for a moving device; a release discards it.
+        # A step is held back until the device stops moving; a release discards it.
         rig.steering.on_device(MOVING)
         assert none_sent(rig.expose())
         assert state_of(rig) == (STEERING, Awaiting.DEVICE)

@@ -20,7 +20,7 @@ from pathlib import Path
 SHARED_MEMORY = Path("/dev/shm")
 _PREFIX = "fastrtps_"
 _PORT = re.compile(rf"{_PREFIX}port\d+")
-# First word of a Boost segment that is uninitialised or being initialised.
+# First word of a Boost segment that is uninitialized or being initialized.
 _INCOMPLETE = (0, 1)
 # Creation takes less than a millisecond, but the process may have to wait for the CPU [s].
 _CREATION_TIME = 1.0

@@ -55,7 +55,7 @@ def run_node(
     Parameters
     ----------
     create : callable
-        Returns the node; called after rclpy is initialised.
+        Returns the node; called after rclpy is initialized.
     help_text : str
         Purpose, topics and services of the node: the first part of `--help`.
     parameters : type

@@ -1,4 +1,4 @@
-"""A component on a bag: timers tick by recorded time, messages without subscriber are dropped."""
+"""A component run from a bag: timers follow recorded time, unused messages are dropped."""
 
 from __future__ import annotations
 

@@ -103,8 +103,8 @@ def read_units(
     Raises
     ------
     DriveError
-        If positions are not in counts, another unit is not accepted, or the counts per turn are
-        missing or inconsistent.
+        If positions are not in counts, the unit of speeds or ramps is not supported, or the counts
+        per turn are missing or inconsistent.
     LinkError
         If the link is lost.
     """

@@ -95,7 +95,7 @@ class DriveProtocol(abc.ABC):
 
     @abc.abstractmethod
     def identify(self) -> Procedure[str]:
-        """Return name and version, and resynchronise a reopened connection.
+        """Return name and version, and resynchronize a reopened connection.
 
         The drive may hold a partial line: end it so that the drive rejects it. The name of an
         emulator begins with "Emulated".

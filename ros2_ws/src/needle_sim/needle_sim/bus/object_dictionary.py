@@ -82,7 +82,7 @@ class StoredObject:
         Whether a PDO may contain it.
     text : bytes
         The text; empty for a number.
-    check, then : callable, optional
+    check, on_written : callable, optional
         Callbacks for writing, see `ObjectDictionary.on_write`.
     default : int
         The number after power-up.
@@ -94,7 +94,7 @@ class StoredObject:
     mappable: bool = False
     text: bytes = b""
     check: Callable[[int], None] | None = None
-    then: Callable[[int], None] | None = None
+    on_written: Callable[[int], None] | None = None
     default: int = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
@@ -130,7 +130,7 @@ class ObjectDictionary:
         subindex: int,
         *,
         check: Callable[[int], None] | None = None,
-        then: Callable[[int], None] | None = None,
+        on_written: Callable[[int], None] | None = None,
     ) -> None:
         """Set callbacks for writing an entry.
 
@@ -140,11 +140,11 @@ class ObjectDictionary:
             Address of the entry.
         check : callable, optional
             Called with the value before it is stored; raises `SdoAbortError` to reject it.
-        then : callable, optional
+        on_written : callable, optional
             Called with the value after it is stored.
         """
         entry = self._entries[index, subindex]
-        entry.check, entry.then = check, then
+        entry.check, entry.on_written = check, on_written
 
     def entry(self, index: int, subindex: int) -> StoredObject:
         """Return an entry.
@@ -200,8 +200,8 @@ class ObjectDictionary:
         if entry.check is not None:
             entry.check(value)
         entry.value = value
-        if entry.then is not None:
-            entry.then(value)
+        if entry.on_written is not None:
+            entry.on_written(value)
 
     def power_up(self) -> None:
         """Reset all values to their defaults."""

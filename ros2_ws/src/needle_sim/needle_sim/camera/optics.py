@@ -83,7 +83,7 @@ def project(points: ArrayLike, camera: SimulatedCamera) -> FloatArray:
 
 
 def _distorted_pixel(x: FloatArray, y: FloatArray, camera: SimulatedCamera) -> FloatArray:
-    """Apply plumb_bob and the camera matrix to normalised image coordinates."""
+    """Apply plumb_bob and the camera matrix to normalized image coordinates."""
     k1, k2, p1, p2, k3 = camera.distortion
     square = x * x + y * y
     radial = 1.0 + square * (k1 + square * (k2 + square * k3))

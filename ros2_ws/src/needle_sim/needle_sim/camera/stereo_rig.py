@@ -194,7 +194,7 @@ def _number(document: Any, key: str, lower: float = -math.inf) -> float:
 
 
 def _unit_vector(document: Any, key: str, size: int) -> FloatArray:
-    """Return a vector, normalised to exactly length 1."""
+    """Return a vector, normalized to exactly length 1."""
     vector = _numbers(document, key, size)
     length = float(np.linalg.norm(vector))
     if abs(length - 1.0) > _LENGTH_TOLERANCE:

@@ -100,8 +100,8 @@ class EmulatedDrive(CanopenDevice):
             boot_time=settings.boot_time,
         )
         self._motion = DriveMotion(objects, self.motor, settings.rpm or 1.0)
-        objects.on_write(CONTROLWORD, 0, then=self._on_controlword)
-        objects.on_write(MODE, 0, check=one_of(MODES), then=self._motion.set_mode)
+        objects.on_write(CONTROLWORD, 0, on_written=self._on_controlword)
+        objects.on_write(MODE, 0, check=one_of(MODES), on_written=self._motion.set_mode)
         for index, choices in _CHOICES.items():
             objects.on_write(index, 0, check=one_of(choices))
         self.state = PowerState.NOT_READY

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from needle_sim.drives.motor import MotorSettings
 from needle_sim.drives.text_drives import TextDrive, TextDrives
 
-# Units of speed and acceleration [1/s, 1/s^2].
+# Drive units per count/s and per count/s^2.
 _PER_SPEED = 1.6384
 _PER_ACCELERATION = 1.6384e-4
 # Distance of the encoder from the profile that counts as a stall, in time at full speed [s].

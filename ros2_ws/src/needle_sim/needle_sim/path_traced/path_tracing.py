@@ -90,7 +90,7 @@ def _refracted(flat: FloatArray, normal: FloatArray) -> FloatArray:
 
 
 def _undistorted(pixels: FloatArray, camera: SimulatedCamera) -> FloatArray:
-    """Return normalised image coordinates: the inverse of plumb_bob by fixed-point iteration."""
+    """Return normalized image coordinates: the inverse of plumb_bob by fixed-point iteration."""
     k1, k2, p1, p2, k3 = camera.distortion
     inverse = np.linalg.inv(camera.camera_matrix[:2, :2])
     distorted = (pixels - camera.camera_matrix[:2, 2]) @ inverse.T

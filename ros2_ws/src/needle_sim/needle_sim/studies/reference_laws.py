@@ -9,7 +9,7 @@ with obstacles" (BioRob 2010); G. J. Vrooijink et al., "Needle path planning and
 three-dimensional non-static environment using two-dimensional ultrasound images" (IJRR 2014). A
 tree of arcs with any curvature up to the needle's grows towards random points; a point is connected
 to the nearest node from which such an arc reaches it (reachability-guided sampling). Duty-cycled
-spinning realises smaller curvatures.
+spinning realizes smaller curvatures.
 """
 
 # Compiled functions do not support keyword arguments well.
@@ -50,7 +50,7 @@ _CHECK_SPACING = 0.001
 
 
 class DutyCycle:
-    """Duty-cycled spinning that realises the curvatures of a plan, for many needles at once.
+    """Duty-cycled spinning that realizes the curvatures of a plan, for many needles at once.
 
     Parameters
     ----------

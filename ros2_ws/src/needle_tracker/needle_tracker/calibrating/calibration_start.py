@@ -177,8 +177,8 @@ def first_calibration(
         board = board_pose(alone, anchor.corners(side))
         transform = board @ np.linalg.inv(anchor.place.T_rig_board)
         if placed and are_posed(cameras):
-            to_left = np.linalg.inv(cameras.left.T_optical_rig)
-            transform = alone.T_optical_rig @ to_left @ placed[0].T_optical_rig
+            from_left = np.linalg.inv(cameras.left.T_optical_rig)
+            transform = alone.T_optical_rig @ from_left @ placed[0].T_optical_rig
         camera = dataclasses.replace(alone, T_optical_rig=transform)
         if camera.window.height(camera.centre) <= 0.0:
             raise UserError(

@@ -88,12 +88,12 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
     """
     start = np.array(start)
     priors = _priors(model, free)
-    parameters, normal, cost = _minimise(model, start, free, corner_sigma_px or 0.3, priors)
+    parameters, normal, cost = _minimize(model, start, free, corner_sigma_px or 0.3, priors)
     residuals = model.residuals(parameters)
     sigma = corner_sigma_px
     if sigma is None:
         weighed = max(_spread(residuals, free, priors), LEAST_CORNER_SIGMA_PX)
-        parameters, normal, cost = _minimise(model, parameters, free, weighed, priors)
+        parameters, normal, cost = _minimize(model, parameters, free, weighed, priors)
         residuals = model.residuals(parameters)
         sigma = _spread(residuals, free, priors)
     covariance = np.zeros((len(start), len(start)))
@@ -174,7 +174,7 @@ def misfit_px(model: RigModel, result: RigFit) -> float:
     return float(np.sqrt(max(np.mean(result.residuals**2) - noise, 0.0)))
 
 
-def _minimise(
+def _minimize(
     model: RigModel, start: Array, free: Mask, sigma: float, priors: tuple[NDArray[np.intp], Array]
 ) -> tuple[Array, Array, float]:
     """Return parameters, normal matrix at them, and cost.

@@ -188,7 +188,7 @@ def load_calibration(path: Path) -> StereoCalibration:
     Returns
     -------
     StereoCalibration
-        Calibration with normalised rotations.
+        Calibration with normalized rotations.
 
     Raises
     ------
@@ -207,7 +207,7 @@ def calibration_from(text: str, path: Path) -> StereoCalibration:
 
 
 def parse_calibration(content: Any) -> StereoCalibration:
-    """Return the calibration in the content of a file, rotations normalised.
+    """Return the calibration in the content of a file, rotations normalized.
 
     Raises
     ------

@@ -97,7 +97,7 @@ def read_registration(path: Path) -> Registration:
 
 
 def _checked(found: Registration) -> Registration:
-    """Return a registration with a normalised quaternion; raise a `UserError` if it is unusable."""
+    """Return a registration with a normalized quaternion; raise a `UserError` if it is unusable."""
     norm = float(np.linalg.norm(found.quaternion))
     check_bounds("norm of T_rig_tracker.rotation", norm, 0.99, 1.01, "-")
     far, tool = (float(np.linalg.norm(v)) for v in (found.translation, found.tip_offset))

@@ -29,7 +29,7 @@ def own_windows(calibration_path: Path) -> Any:
     return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
-def test_rotations_agree_with_scipy_and_are_normalised(content: Any) -> None:
+def test_rotations_agree_with_scipy_and_are_normalized(content: Any) -> None:
     for seed in range(5):
         rotation = Rotation.random(rng=np.random.default_rng(seed))
         found = rotation_matrix(rotation.as_quat())

@@ -1,4 +1,4 @@
-"""Pairs by stamp, and the insertion between joint states."""
+"""Pairing of images by stamp, and interpolation of the insertion between joint states."""
 
 from __future__ import annotations
 

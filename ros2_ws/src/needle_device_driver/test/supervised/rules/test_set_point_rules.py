@@ -27,9 +27,9 @@ def test_look_ahead_refuses_a_farther_set_point() -> None:
     assert why in refused(bench, at + 2022 / 20e6, Rule.LOOK_AHEAD)
     bench.axes[0].start_move(at + 2021 / 20e6, 0.005)
     bench.axes[0].start_move(at, 0.005)
-    most = (math.pi * 0.02 * 1.01 * RAD) + 1
-    refused(bench, bench.joint(1) + (most + 1) / RAD, Rule.LOOK_AHEAD, 1)
-    bench.axes[1].start_move(bench.joint(1) + (most - 1) / RAD, 0.005)
+    largest_step = (math.pi * 0.02 * 1.01 * RAD) + 1
+    refused(bench, bench.joint(1) + (largest_step + 1) / RAD, Rule.LOOK_AHEAD, 1)
+    bench.axes[1].start_move(bench.joint(1) + (largest_step - 1) / RAD, 0.005)
 
 
 @pytest.mark.parametrize("left_over", [-90, 90])
@@ -148,7 +148,7 @@ def test_software_limits_without_home_are_the_counter_range(reverse: bool, at: i
 
 def test_no_motion_by_itself_on_set_up_enable_and_reset() -> None:
     bench = DriveBench()
-    # The drive has an earlier set-point of another program.
+    # The drive still holds a set-point from another program.
     bench.insertion.position, bench.insertion.next_target = 12_345, 99_999
     bench.configured()
     bench.wait(5)
