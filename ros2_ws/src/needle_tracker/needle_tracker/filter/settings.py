@@ -35,7 +35,8 @@ class FilterSettings:
     max_log_odds : float
         Largest absolute log-odds of a track.
     accepted : float
-        Probability above which a track is accepted as the needle.
+        Probability above which a track is accepted as the needle: in 2,250 pairs of the quick
+        renderer and 50 path-traced ones, no additional wrong tip has a probability above 0.55.
     end_sigma : float
         Standard deviation of the end along the needle that both views and all pairs share, since a
         bevel and its lighting hide part of it [needle widths]: from errors in path-traced pairs.
@@ -55,7 +56,7 @@ class FilterSettings:
     evidence_length: float = 10e-3
     miss_cost: float = 0.5
     max_log_odds: float = 8.0
-    accepted: float = 0.85
+    accepted: float = 0.7
     end_sigma: float = 0.3
     max_sigma: float = 0.8e-3
     lost_after: int = 10
