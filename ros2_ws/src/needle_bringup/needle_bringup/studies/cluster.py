@@ -37,7 +37,7 @@ CONNECTS_WITHIN = 30.0
 _NUMERICAL = ("numpy", "scipy", "numba")
 _PACKAGES = (
     "needle_bags", "needle_bringup", "needle_core", "needle_console",
-    "needle_controller", "needle_device_driver", "needle_sim", "needle_tracker", "scenario",
+    "needle_controller", "needle_device_driver", "needle_sim", "needle_tracker",
 )  # fmt: skip
 
 
@@ -77,7 +77,7 @@ def on_cluster(
         ) from error
     # Disable its log, because it also raises the logged errors.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-    run = functools.partial(_run, work, identity())
+    run = functools.partial(_run, work, identity(_package_of(work)))
     # Results that arrived before those of earlier parts.
     early: dict[int, Result] = {}
     yielded = 0
@@ -114,10 +114,10 @@ def on_cluster(
 
 
 @functools.lru_cache(maxsize=1)
-def identity() -> Mapping[str, str]:
-    """Return the library versions and a digest of the code in this process."""
+def identity(package_of_work: str) -> Mapping[str, str]:
+    """Return the library versions and a digest of the rig's code and the package of the work."""
     code = hashlib.sha256()
-    for package in _PACKAGES:
+    for package in sorted({*_PACKAGES, package_of_work}):
         spec = importlib.util.find_spec(package)
         for place in spec.submodule_search_locations or () if spec is not None else ():
             for module in sorted(Path(place).rglob("*.py")):
@@ -128,9 +128,13 @@ def identity() -> Mapping[str, str]:
     return {"python": python, **versions, "code": code.hexdigest()[:12]}
 
 
+def _package_of(work: Callable[[Part], Result]) -> str:
+    return work.__module__.partition(".")[0]
+
+
 def _run(work: Callable[[Part], Result], expected: Mapping[str, str], part: Part) -> Result:
     """Run a part on a worker."""
-    here = identity()
+    here = identity(_package_of(work))
     differing = [
         f"{name} {here[name]} instead of {expected[name]}"
         for name in expected

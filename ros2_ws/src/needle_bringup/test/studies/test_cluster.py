@@ -121,9 +121,9 @@ def test_cluster_errors_are_one_line(dask: Dask, monkeypatch: pytest.MonkeyPatch
 def test_a_worker_with_different_code_is_rejected(
     dask: Dask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here = cluster.identity()
+    here = cluster.identity("needle_sim")
     known = iter([{**here, "numpy": "1.0.0"}, here])
-    monkeypatch.setattr(cluster, "identity", lambda: next(known))
+    monkeypatch.setattr(cluster, "identity", lambda _: next(known))
     with pytest.raises(UserError, match=r"has numpy \S+ instead of 1\.0\.0; all machines"):
         list(on_cluster(ADDRESS, square, [1]))
 
