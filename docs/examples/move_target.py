@@ -13,16 +13,16 @@ AT, TARGET = 0.04, (0.003, -0.026, 0.1)  # insertion [m]; x, y, z in rig [m]
 
 
 class MoveTarget(Node):
-    """Hears how far the needle is, and publishes one target_point."""
+    """Receives the insertion depth, and publishes one target_point."""
 
     def __init__(self):
         super().__init__("move_target")
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.target = self.create_publisher(PointStamped, "target_point", latched)
-        self.create_subscription(JointState, "joint_states", self.take_joints, 10)
+        self.create_subscription(JointState, "joint_states", self.on_joints, 10)
         self.moved = False
 
-    def take_joints(self, joints):
+    def on_joints(self, joints):
         """Move the target, once."""
         insertion = joints.position[joints.name.index("insertion_joint")]
         if insertion >= AT and not self.moved:

@@ -37,15 +37,15 @@ class TopicController(Node):
         self.seen = self.after = 0  # stamps: the newest tip's, and what the next must be newer than
         self.commands = self.create_publisher(JointTrajectory, "device/joint_trajectory", 10)
         self.status = self.create_publisher(DiagnosticStatus, "needle/controller_status", LATCHED)
-        self.create_subscription(JointState, "joint_states", self.take_joints, 10)
-        self.create_subscription(PointStamped, "needle/tip", self.take_tip, 10)
-        self.create_subscription(Header, "device/result", self.take_result, 10)
-        self.create_subscription(DiagnosticStatus, "device/status", self.take_device, LATCHED)
+        self.create_subscription(JointState, "joint_states", self.on_joints, 10)
+        self.create_subscription(PointStamped, "needle/tip", self.on_tip, 10)
+        self.create_subscription(Header, "device/result", self.on_result, 10)
+        self.create_subscription(DiagnosticStatus, "device/status", self.on_device, LATCHED)
         self.create_service(Trigger, "~/start", self.start)
-        self.say("IDLE", "nothing")
+        self.publish_status("IDLE", "nothing")
 
-    def say(self, state, awaiting):
-        """Tell sim_rig whether a tip is wanted, and everybody how far the needle is."""
+    def publish_status(self, state, awaiting):
+        """Publish the state, the insertion depth and whether a tip is awaited."""
         self.awaiting = awaiting
         keys = {"state": state, "awaiting": awaiting, "tip_after_ns": self.after, "depth_m": DEPTH}
         keys |= {"starts": self.starts, "step": len(self.tips), "insertion_m": self.joints[0]}
@@ -53,22 +53,22 @@ class TopicController(Node):
         self.status.publish(DiagnosticStatus(name="plane_controller: steering", values=values))
 
     def start(self, _, answer):
-        """Begin: as soon as somebody holds, the next tip leads to the first step."""
+        """Begin: as soon as the hold is pressed, the next tip leads to the first step."""
         self.starts, self.tips, answer.success = self.starts + 1, [], True
-        self.say("STEERING", "hold")
+        self.publish_status("STEERING", "hold")
         return answer
 
-    def take_device(self, device):
-        """Go on when somebody holds: without that the device takes no step."""
+    def on_device(self, device):
+        """Continue when the hold is pressed; without it the device executes no step."""
         held = any(pair.key == "hold_owner" and pair.value for pair in device.values)
         if held and self.awaiting == "hold":
-            self.say("STEERING", "tip")
+            self.publish_status("STEERING", "tip")
 
-    def take_joints(self, joints):
+    def on_joints(self, joints):
         """Keep how far the needle's base is in and turned."""
         self.joints = [joints.position[joints.name.index(joint)] for joint in JOINTS]
 
-    def take_tip(self, tip):
+    def on_tip(self, tip):
         """Turn the bevel by how far the needle is from its way, and go on by a step."""
         self.seen = tip.header.stamp.sec * 10**9 + tip.header.stamp.nanosec
         if self.awaiting != "tip" or self.seen <= self.after:
@@ -87,18 +87,18 @@ class TopicController(Node):
         step = JointTrajectory(header=tip.header, joint_names=JOINTS, points=[point])
         self.commands.publish(step)
 
-    def take_result(self, result):
+    def on_result(self, result):
         """Ask for the next tip once the step is done, or for the hold that has ended it."""
         if self.awaiting != "result":
             return
         self.after = self.seen  # a tip of before the answer may be one of before the step's end
         if result.frame_id != "succeeded":
-            self.say("STEERING", "hold")
+            self.publish_status("STEERING", "hold")
         elif self.aim < DEPTH:
-            self.say("STEERING", "tip")
+            self.publish_status("STEERING", "tip")
         else:
             self.get_logger().info(f"done, {self.above * 1e3:.2f} mm above the plane")
-            self.say("DONE", "nothing")
+            self.publish_status("DONE", "nothing")
 
 
 rclpy.init()

@@ -173,7 +173,7 @@ def bag_read_error(bag: Path) -> str:
     try:
         with Reader(bag) as reader:
             count = sum(1 for _ in reader.messages())
-            told = reader.message_count
+            reported = reader.message_count
         measured = 0
         for file in bag.glob("*.mcap"):
             with file.open("rb") as stream:
@@ -181,6 +181,6 @@ def bag_read_error(bag: Path) -> str:
     # Any error is a finding.
     except Exception as error:  # noqa: BLE001
         return f"{type(error).__name__}: {error}"
-    if told == count == measured:
+    if reported == count == measured:
         return ""
-    return f"metadata.yaml reports {told} messages, rosbags reads {count}, mcap {measured}"
+    return f"metadata.yaml reports {reported} messages, rosbags reads {count}, mcap {measured}"

@@ -120,15 +120,15 @@ def test_every_block_works_as_written(
         session = Session(checkout, environment, print, shortened(scratch, runs))
         session.type(checkout / page)
     if page == "docs/examples/README.md":
-        (from_topics,) = (said for said in session.said if "above the plane" in said)
+        (from_topics,) = (text for text in session.outputs if "above the plane" in text)
         (above,) = re.findall(r"done, (\S+) mm above the plane", from_topics)
         assert abs(float(above)) < 1.0
-        (moved,) = (said for said in session.said if "the target moves to" in said)
+        (moved,) = (text for text in session.outputs if "the target moves to" in text)
         assert "plane_controller]: target_point at (0.003, -0.026, 0.1) m" in moved
-        assert any("warning: curvature differs" in said for said in session.said)
+        assert any("warning: curvature differs" in text for text in session.outputs)
     if page == "docs/hardware.md":
-        _, succeeded, joints = session.said[-1].partition("frame_id: succeeded")
-        assert succeeded, session.said[-1]
+        _, succeeded, joints = session.outputs[-1].partition("frame_id: succeeded")
+        assert succeeded, session.outputs[-1]
         insertion, rotation = map(float, re.findall(r"-?\d[\d.e-]*", joints))
         assert insertion == pytest.approx(0.001, abs=1e-5)
         assert rotation == pytest.approx(0.1, abs=2e-3)

@@ -31,10 +31,10 @@ class Partner(Node):
         super().__init__("partner", namespace="rig", context=context)
         self.declare_parameter("speed", 0.005)
         self.declare_parameter("names", ["a", "b"])
-        self.heard: list[Joy] = []
+        self.received: list[Joy] = []
         self.asked: list[bool] = []
         best_effort = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self.create_subscription(Joy, "hold", self.heard.append, best_effort)
+        self.create_subscription(Joy, "hold", self.received.append, best_effort)
         self.create_service(SetBool, "enable", self.enable)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.once = self.create_publisher(Header, "status", latched)
@@ -44,7 +44,7 @@ class Partner(Node):
 
     def enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self.asked.append(request.data)
-        response.success, response.message = request.data, "heard"
+        response.success, response.message = request.data, "received"
         return response
 
 
@@ -119,29 +119,29 @@ def test_echo_receives_earlier_messages_and_shortens_arrays(ros2: Ros2) -> None:
 def test_pub_sends_the_requested_messages_with_increasing_stamps(
     ros2: Ros2, partner: Partner
 ) -> None:
-    partner.heard.clear()
-    said = ros2(
+    partner.received.clear()
+    result = ros2(
         "topic", "pub", "--times", "5", "--rate", "100", "--print", "0", "/rig/hold",
         "sensor_msgs/msg/Joy",
         "{header: {stamp: now, frame_id: me}, axes: [1], buttons: [1]}",
     )  # fmt: skip
-    assert (said.returncode, said.stderr) == (0, "")
-    assert said.stdout.endswith("publisher: beginning loop\n")
-    stamps = [(m.header.stamp.sec, m.header.stamp.nanosec) for m in partner.heard]
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.endswith("publisher: beginning loop\n")
+    stamps = [(m.header.stamp.sec, m.header.stamp.nanosec) for m in partner.received]
     assert len(stamps) == 5
     assert sorted(set(stamps)) == stamps
-    assert partner.heard[0].header.frame_id == "me"
-    assert list(partner.heard[0].axes) == [1.0]
-    assert list(partner.heard[0].buttons) == [1]
+    assert partner.received[0].header.frame_id == "me"
+    assert list(partner.received[0].axes) == [1.0]
+    assert list(partner.received[0].buttons) == [1]
 
 
 def test_call_prints_request_and_answer(ros2: Ros2, partner: Partner) -> None:
     partner.asked.clear()
-    said = ros2("service", "call", "/rig/enable", "std_srvs/srv/SetBool", "{data: true}")
+    result = ros2("service", "call", "/rig/enable", "std_srvs/srv/SetBool", "{data: true}")
     assert partner.asked == [True]
-    assert "requester: making request: std_srvs.srv.SetBool_Request(data=True)\n" in said.stdout
-    answer = "response:\nstd_srvs.srv.SetBool_Response(success=True, message='heard')\n\n"
-    assert said.stdout.endswith(answer)
+    assert "requester: making request: std_srvs.srv.SetBool_Request(data=True)\n" in result.stdout
+    answer = "response:\nstd_srvs.srv.SetBool_Response(success=True, message='received')\n\n"
+    assert result.stdout.endswith(answer)
 
 
 def test_parameters_are_read_and_set(ros2: Ros2) -> None:
@@ -183,7 +183,7 @@ def test_a_missing_answer_is_reported(domain: int, ros2: Ros2) -> None:
     ],
 )
 def test_errors_are_one_line(ros2: Ros2, arguments: tuple[str, ...], words: str) -> None:
-    said = ros2(*arguments)
-    assert said.returncode == 1
-    assert words in said.stderr
-    assert len(said.stderr.splitlines()) == 1
+    result = ros2(*arguments)
+    assert result.returncode == 1
+    assert words in result.stderr
+    assert len(result.stderr.splitlines()) == 1

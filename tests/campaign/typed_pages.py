@@ -159,7 +159,7 @@ class Session:
         self._change = change
         self._nodes: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
         self._logs = Path()
-        self.said: list[str] = []
+        self.outputs: list[str] = []
 
     def type(self, page: Path) -> None:
         """Type a page, then end its nodes.
@@ -211,12 +211,12 @@ class Session:
         if runs and (words[3] in NODES or "--loop" in words):
             self._start_node(words[3], command)
             return
-        said = self._run(command)
+        text = self._run(command)
         end = time.monotonic() + READY
-        while "success=False" in said:
+        while "success=False" in text:
             if time.monotonic() > end:
-                raise PageError(f"{command}\n{said}")
-            said = self._run(command)
+                raise PageError(f"{command}\n{text}")
+            text = self._run(command)
 
     def _open(self, command: str, stdin: int, output: IO[Any]) -> subprocess.Popen[bytes]:
         """Start a command in a shell with the environment of this checkout."""
@@ -244,11 +244,11 @@ class Session:
                 process.wait()
                 raise
             output.seek(0)
-            said = output.read()
-        self.said.append(said)
+            text = output.read()
+        self.outputs.append(text)
         if code != int(expected[1] if expected else 0):
-            raise PageError(f"{command}\nends with {code}: {said}")
-        return said
+            raise PageError(f"{command}\nends with {code}: {text}")
+        return text
 
     def _end_of(self, process: subprocess.Popen[bytes], command: str) -> int:
         """Return the exit code of a command; the nodes must run until then."""
@@ -304,9 +304,9 @@ class Session:
                 raise PageError(f"{name} does not end on Ctrl-C") from error
             assert process.stdin is not None
             process.stdin.close()
-            said = log.read_text("utf-8")
-            if code not in (0, 130) or "Traceback" in said:
-                raise PageError(f"{name} ends with {code}: {said}")
+            text = log.read_text("utf-8")
+            if code not in (0, 130) or "Traceback" in text:
+                raise PageError(f"{name} ends with {code}: {text}")
             del self._nodes[name]
 
 

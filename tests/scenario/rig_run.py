@@ -166,7 +166,7 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
         if message.pressed:
             (watch.observe_hold if node == rig.hand_node else watch.observe_other_hold)(rig.now)
 
-    def hear(message: m.HoldState, now: float) -> None:
+    def receive(message: m.HoldState, now: float) -> None:
         pressed = message.pressed and 0.0 <= message.speed_scale <= 1.0
         watch.hold_monitor.receive(now, message.source, pressed=pressed, lifetime=message.lifetime)
 
@@ -175,13 +175,13 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
     rig.watch("device/status", lambda _, message: watch.observe_device(rig.now, message))
     rig.watch(
         "needle/controller_status",
-        lambda _, message: watch.observe_belief(rig.now, message, joints_heard=not joints_faulty),
+        lambda _, message: watch.observe_belief(rig.now, message, joints_known=not joints_faulty),
     )
     rig.watch("device/joint_trajectory", observe_command)
-    rig.watch("device/estop", lambda _, said: watch.observe_estop(rig.now, pressed=said.pressed))
+    rig.watch("device/estop", lambda _, estop: watch.observe_estop(rig.now, pressed=estop.pressed))
     rig.watch("device/hold", observe_hold)
     if _HOLD in rogue or any(fault.part == of.SECOND_PERSON for fault in faults):
-        rig.on_hold_received = hear
+        rig.on_hold_received = receive
     return watch
 
 

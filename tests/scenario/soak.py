@@ -62,7 +62,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
         "run on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786, with the same "
         "results (docs/several_computers.md)"
     )
-    for name, kind, default, metavar, told in (
+    for name, kind, default, metavar, text in (
         ("--runs", int, 300, "N", "number of runs (300)"),
         ("--processes", int, 0, "N", "number of runs of real processes (0)"),
         ("--seed", int, 1, "S", "seed of the first run (1)"),
@@ -71,7 +71,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
         ("--scheduler", str, "", "ADDRESS", cluster),
         ("--json", Path, None, "FILE", "also write the figures as flat JSON"),
     ):
-        parser.add_argument(name, type=kind, default=default, metavar=metavar, help=told)
+        parser.add_argument(name, type=kind, default=default, metavar=metavar, help=text)
     return parser.parse_args(arguments)
 
 
@@ -100,7 +100,7 @@ def _soak(options: argparse.Namespace) -> int:
         for result in results:
             tally.add(result)
             if result.violations:
-                _tell(result, options.failures)
+                _report(result, options.failures)
             if sys.stderr.isatty():
                 print(f"\r{tally.progress}", end="", file=sys.stderr)
     except KeyboardInterrupt:
@@ -116,7 +116,7 @@ def _soak(options: argparse.Namespace) -> int:
     return EXIT_MISSED if tally.violations else EXIT_DONE
 
 
-def _tell(result: RunResult, folder: Path | None) -> None:
+def _report(result: RunResult, folder: Path | None) -> None:
     if result.of_processes:
         # Real time is not repeatable, so the schedule is not shrunk.
         _print_violations(f"processes, seed {result.seed}", result.violations)
@@ -137,9 +137,9 @@ def _tell(result: RunResult, folder: Path | None) -> None:
     _print_violations(f"seed {result.seed}", result.violations)
     keep(result.faults)
     kept = shrink(result.faults, still)
-    told = list(run(result.seed, kept).relative_to_moments)
-    if still(told):
-        kept = told
+    relative = list(run(result.seed, kept).relative_to_moments)
+    if still(relative):
+        kept = relative
     _print_faults(kept)
     keep(kept)
 

@@ -29,8 +29,8 @@ class Cluster:
             subprocess.PIPE, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"
         )
         assert self.scheduler.stderr is not None
-        said = iter(self.scheduler.stderr.readline, "")
-        self.address = next(line.split()[-1] for line in said if "Scheduler at:" in line)
+        lines = iter(self.scheduler.stderr.readline, "")
+        self.address = next(line.split()[-1] for line in lines if "Scheduler at:" in line)
         self.workers = self._start(
             subprocess.DEVNULL, "worker", self.address, "--nworkers", str(workers),
             "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder),

@@ -29,8 +29,8 @@ class Scene:
 
     def message_to(self, page: int) -> dict[str, Any]:
         """Send a page a message now; return it."""
-        told: dict[str, Any] = json.loads(self.protocol.message_for(page, self.now))
-        return told
+        message: dict[str, Any] = json.loads(self.protocol.message_for(page, self.now))
+        return message
 
     def count(self, page: int) -> int:
         """Send a page a count now."""

@@ -187,8 +187,8 @@ def _unless_stopped(set_up: Any, driver: DeviceDriver, now: float) -> Any:
 
 
 def _monitor_forgets(**values: float) -> Plant:
-    def forgetful(observe_device: Any, watch: InvariantMonitor, at: float, said: Any) -> None:
-        observe_device(watch, at, said)
+    def forgetful(observe_device: Any, watch: InvariantMonitor, at: float, status: Any) -> None:
+        observe_device(watch, at, status)
         vars(watch).update(values)
 
     return wrapped(InvariantMonitor, "observe_device", forgetful)

@@ -167,9 +167,9 @@ class Bench:
         assert isinstance(self.node.component, Echo)
         self.echo = self.node.component
         self.other = Node("other", context=context)
-        self.heard: list[str] = []
+        self.received: list[str] = []
         self.health: dict[str, str] = {}
-        self.hear("said")
+        self.subscribe("said")
         self.other.create_subscription(
             DiagnosticArray, "/diagnostics", self._on_health, base_node.RELIABLE
         )
@@ -191,22 +191,22 @@ class Bench:
             parameter_overrides=given,
         )
 
-    def hear(self, topic: str, delivery: Any = base_node.RELIABLE) -> None:
+    def subscribe(self, topic: str, delivery: Any = base_node.RELIABLE) -> None:
         self.other.create_subscription(
-            String, topic, lambda text: self.heard.append(text.data), delivery
+            String, topic, lambda text: self.received.append(text.data), delivery
         )
 
     def until(self, condition: Callable[[], bool]) -> None:
         end = time.monotonic() + PATIENCE
         while not condition():
-            assert time.monotonic() < end, (self.heard, self.health, self.echo.answers)
+            assert time.monotonic() < end, (self.received, self.health, self.echo.answers)
             self._executor.spin_once(timeout_sec=0.02)
 
     def say(self, text: str) -> None:
         """Publish a word, and wait for its echo."""
-        before = len(self.heard)
+        before = len(self.received)
         self.words.publish(String(data=text))
-        self.until(lambda: text in self.heard[before:])
+        self.until(lambda: text in self.received[before:])
 
     def call(self, kind: type[Any], name: str, **request: Any) -> Any:
         client = self.other.create_client(kind, name)
@@ -247,7 +247,7 @@ def test_bad_or_long_data_and_a_failing_handler_are_reported_and_end_nothing(ben
     bench.say("fail")
     bench.until(lambda: "internal error: ValueError: no such word" in health("handlers"))
     bench.say("on")
-    assert bench.heard == ["fail", "on"]
+    assert bench.received == ["fail", "on"]
 
 
 def test_services_ports_and_calls_are_answered(bench: Bench) -> None:
@@ -271,8 +271,8 @@ def test_services_ports_and_calls_are_answered(bench: Bench) -> None:
 
 def test_latched_messages_lazy_inputs_and_peers_and_a_qos_that_does_not_fit(bench: Bench) -> None:
     bench.say("keep")
-    bench.hear("echo/kept", base_node.LATCHED)
-    bench.until(lambda: "kept" in bench.heard)
+    bench.subscribe("echo/kept", base_node.LATCHED)
+    bench.until(lambda: "kept" in bench.received)
     whisper = bench.other.create_publisher(String, "whisper", base_node.RELIABLE)
     for word, listeners in (("listen", 1), ("leave", 0)):
         bench.say(word)
@@ -294,18 +294,18 @@ def test_parameters_are_applied_together_typed_and_within_bounds_or_rejected(ben
         return answer.results[-1].successful, answer.results[0].reason
 
     assert set_to(message(2.0)) == (True, "")
-    bench.until(lambda: bench.heard == ["gain 2"])
+    bench.until(lambda: bench.received == ["gain 2"])
     assert not set_to(message(20.0))[0]
     clock = Parameter("use_sim_time", value=True).to_parameter_msg()
     assert set_to(clock) == (False, "use_sim_time is fixed at start")
     assert bench.echo.settings == Settings(2.0)
-    for given, said in (
+    for given, cause in (
         ({"gian": 2.0}, "unknown parameter 'gian' (did you mean 'gain'?)"),
         ({"use_sim_time": True}, "use_sim_time = true: this node runs in real time"),
     ):
         with pytest.raises(UserError) as caught:
             bench.make(**given)
-        assert str(caught.value).startswith(f"/echo: {said}")
+        assert str(caught.value).startswith(f"/echo: {cause}")
 
 
 def test_a_node_ends_on_sigterm_as_its_component_wishes(

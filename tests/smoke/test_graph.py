@@ -41,6 +41,6 @@ def test_drives_are_steered_by_a_graph_of_nodes_and_the_bag_is_whole(tmp_path: P
     assert (bag / "report.html").stat().st_size > 1000
     with Reader(bag) as reader:
         assert set(reader.topics) >= TOPICS
-        heard = {topic: info.msgcount for topic, info in reader.topics.items()}
+        counts = {topic: info.msgcount for topic, info in reader.topics.items()}
         assert sum(1 for _ in reader.messages()) == reader.message_count
-    assert min(heard[topic] for topic in TOPICS) > 0
+    assert min(counts[topic] for topic in TOPICS) > 0

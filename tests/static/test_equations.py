@@ -22,7 +22,7 @@ CITED = re.compile(r"(?<![\w.])\((\d{1,2})\)(?:-\((\d{1,2})\))?")
 NAME = re.compile(r"`(needle_\w+(?:\.\w+)+)`")
 
 
-def said_in(source: str) -> Iterator[str]:
+def texts_of(source: str) -> Iterator[str]:
     """Yield the docstrings and comments of a module."""
     for part in ast.walk(ast.parse(source)):
         if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant):
@@ -45,7 +45,7 @@ def by_code() -> dict[int, set[str]]:
     for package in PACKAGES:
         for path in (SOURCES / package / package).rglob("*.py"):
             module = ".".join(path.relative_to(SOURCES / package).with_suffix("").parts)
-            for text in said_in(path.read_text("utf-8")):
+            for text in texts_of(path.read_text("utf-8")):
                 for number in cited(text):
                     found.setdefault(number, set()).add(module)
     return found

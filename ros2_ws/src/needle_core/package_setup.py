@@ -22,18 +22,18 @@ def set_up(script: str) -> None:
     """
     folder = Path(script).resolve().parent
     manifest = {one.tag: one for one in ElementTree.parse(folder / "package.xml").iter()}
-    said = {tag: one.text or "" for tag, one in manifest.items()}
+    texts = {tag: one.text or "" for tag, one in manifest.items()}
     setup(
         name=folder.name,
-        version=said["version"],
+        version=texts["version"],
         packages=find_packages(include=[folder.name, f"{folder.name}.*"]),
         package_data=_PACKAGE_DATA,
         data_files=data_files(folder, Path()),
         zip_safe=False,
-        maintainer=said["maintainer"],
+        maintainer=texts["maintainer"],
         maintainer_email=manifest["maintainer"].get("email"),
-        description=said["description"],
-        license=said["license"],
+        description=texts["description"],
+        license=texts["license"],
         entry_points={"console_scripts": executables(folder), "pytest11": test_plugins(folder)},
     )
 

@@ -31,13 +31,13 @@ def api_pages() -> dict[str, str]:
     for library in LIBRARIES:
         package, _, name = library.partition(".")
         folder = SOURCES / package / package / name
-        said = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or ""
-        rows.append((f"[`{library}`](api/{library}.md)", said.partition("\n\n")[0]))
+        text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or ""
+        rows.append((f"[`{library}`](api/{library}.md)", text.partition("\n\n")[0]))
         modules = [path.stem for path in sorted(folder.glob("*.py")) if path.stem != "__init__"]
         found[f"api/{library}.md"] = "\n\n".join(
             (
                 f"# {library}",
-                said,
+                text,
                 *(_automodule(library, module) for module in modules),
             )
         )

@@ -29,15 +29,15 @@ def scripts() -> list[str]:
 
 def help_of_module(module: str, name: str) -> str:
     """Return the `--help` text of a command, run in this process."""
-    said = io.StringIO()
+    output = io.StringIO()
     with (
-        contextlib.redirect_stdout(said),
+        contextlib.redirect_stdout(output),
         contextlib.suppress(SystemExit),
         mock.patch.object(sys, "argv", [name, "--help"]),
         mock.patch.dict(os.environ, COLUMNS=_WIDTH),
     ):
         importlib.import_module(module).main()
-    return said.getvalue()
+    return output.getvalue()
 
 
 def help_of_script(name: str) -> str:

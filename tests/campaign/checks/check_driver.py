@@ -95,13 +95,13 @@ def killed_nodes(_: Workbench) -> Iterator[Finding]:
     rng = random.Random(4)
     for node in PARTS:
         ends = [in_own_process(_kill, n, node, rng.uniform(0.0, 2.0)) for n in range(MOMENTS)]
-        said = [f"{one.invariant}: {one.text}" for result in ends for one in result.violations]
+        texts = [f"{one.invariant}: {one.text}" for result in ends for one in result.violations]
         yield Finding(
             f"killed_{node}",
             f"kill -9 of {node} at {MOMENTS} moments of an insertion in real time",
             "no motion beyond the command and the hold, none by itself; the way goes on",
-            f"{len(said)} violations {said[:2]}",
-            not said,
+            f"{len(texts)} violations {texts[:2]}",
+            not texts,
         )
 
 

@@ -69,9 +69,9 @@ def address() -> Iterator[str]:
     ) as console:
         try:
             assert console.stdout is not None
-            said = re.match(r"(\S+) ", console.stdout.readline())
-            assert said
-            yield said[1]
+            match = re.match(r"(\S+) ", console.stdout.readline())
+            assert match
+            yield match[1]
         finally:
             console.send_signal(signal.SIGINT)
             _, complaints = console.communicate(timeout=LIMIT)

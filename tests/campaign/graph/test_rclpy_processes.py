@@ -43,7 +43,7 @@ sys.exit(run_node(node, help_text="", parameters=object, args=["one"], spin=spin
     assert done.returncode == 7
 
 
-SAYS = """
+PUBLISHER = """
 import sys
 import time
 from rclpy.node import Node
@@ -51,9 +51,9 @@ from std_msgs.msg import String
 from needle_core.ros.main import run_node
 from needle_core.ros.base_node import RELIABLE
 
-class Says(Node):
+class Publisher(Node):
     def __init__(self):
-        super().__init__("says")
+        super().__init__("publisher")
         self.words = self.create_publisher(String, "words", RELIABLE)
 
     def destroy_node(self):
@@ -63,16 +63,16 @@ class Says(Node):
 def spin(node, end):
     while not node.words.get_subscription_count():
         time.sleep(0.01)
-    print("is listened to", flush=True)
+    print("has a subscriber", flush=True)
     sys.stdin.readline()
     for number in range(10):
         node.words.publish(String(data=str(number)))
-    print("has said it", flush=True)
+    print("has published", flush=True)
     return 7
 
-sys.exit(run_node(Says, help_text="", parameters=object, args=["says"], spin=spin))
+sys.exit(run_node(Publisher, help_text="", parameters=object, args=["publisher"], spin=spin))
 """
-HEARS = """
+SUBSCRIBER = """
 import sys
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -81,17 +81,17 @@ from needle_core.ros.main import run_node
 from needle_core.ros.base_node import RELIABLE
 
 def spin(node, end):
-    heard = []
-    node.create_subscription(String, "words", lambda word: heard.append(word.data), RELIABLE)
+    received = []
+    node.create_subscription(String, "words", lambda word: received.append(word.data), RELIABLE)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    while "9" not in heard:
+    while "9" not in received:
         executor.spin_once(timeout_sec=0.1)
-    print(*heard, flush=True)
+    print(*received, flush=True)
     return 0
 
-node = lambda: Node("hears")
-sys.exit(run_node(node, help_text="", parameters=object, args=["hears"], spin=spin))
+node = lambda: Node("subscriber")
+sys.exit(run_node(node, help_text="", parameters=object, args=["subscriber"], spin=spin))
 """
 
 
@@ -111,21 +111,21 @@ def test_a_node_exits_after_a_stalled_subscriber_has_its_messages() -> None:
             ends.callback(process.kill)
             return process
 
-        says, hears = start(SAYS), start(HEARS)
-        assert says.stdin is not None
-        assert says.stdout is not None
-        assert says.stdout.readline() == b"is listened to\n"
-        hears.send_signal(signal.SIGSTOP)
+        publisher, subscriber = start(PUBLISHER), start(SUBSCRIBER)
+        assert publisher.stdin is not None
+        assert publisher.stdout is not None
+        assert publisher.stdout.readline() == b"has a subscriber\n"
+        subscriber.send_signal(signal.SIGSTOP)
         # Wait until all of its threads are stopped.
-        os.waitid(os.P_PID, hears.pid, os.WSTOPPED)
+        os.waitid(os.P_PID, subscriber.pid, os.WSTOPPED)
         try:
-            says.stdin.write(b"\n")
-            assert says.stdout.readline() == b"has said it\n"
-            assert select.select([says.stdout], [], [], 1.5)[0] == []
+            publisher.stdin.write(b"\n")
+            assert publisher.stdout.readline() == b"has published\n"
+            assert select.select([publisher.stdout], [], [], 1.5)[0] == []
         finally:
-            hears.send_signal(signal.SIGCONT)
-        assert says.wait(30.0) == 7
-        assert hears.communicate(timeout=30.0)[0].split() == b"0 1 2 3 4 5 6 7 8 9".split()
+            subscriber.send_signal(signal.SIGCONT)
+        assert publisher.wait(30.0) == 7
+        assert subscriber.communicate(timeout=30.0)[0].split() == b"0 1 2 3 4 5 6 7 8 9".split()
 
 
 CLAIMS = """

@@ -33,11 +33,11 @@ from std_msgs.msg import Bool
 rclpy.init()
 node = rclpy.create_node("stranger")
 latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-names, stops, heard = ("open", "closed"), {}, {"open": "", "closed": ""}
+names, stops, states = ("open", "closed"), {}, {"open": "", "closed": ""}
 for name in names:
     stops[name] = node.create_publisher(Bool, f"/{name}/device/estop", 10)
     def take(message, name=name):
-        heard[name] = {pair.key: pair.value for pair in message.values}["state"]
+        states[name] = {pair.key: pair.value for pair in message.values}["state"]
     node.create_subscription(DiagnosticStatus, f"/{name}/device/status", take, latched)
 begin = time.monotonic()
 def press(end):
@@ -45,11 +45,11 @@ def press(end):
         for publisher in stops.values():
             publisher.publish(Bool(data=True))
         rclpy.spin_once(node, timeout_sec=0.1)
-press(lambda: heard["open"] == "ESTOPPED" or time.monotonic() > begin + 30.0)
+press(lambda: states["open"] == "ESTOPPED" or time.monotonic() > begin + 30.0)
 end = time.monotonic() + (time.monotonic() - begin) + 2.0
 press(lambda: time.monotonic() > end)
 found = sorted(space for name, space in node.get_node_names_and_namespaces() if name != "stranger")
-print(json.dumps({"heard": heard, "found": found}))
+print(json.dumps({"states": states, "found": found}))
 """
 # Package and parameters of each node.
 NODES = {
@@ -141,6 +141,6 @@ def test_another_computer_neither_discovers_nor_stops_a_closed_rig(
             check=True,
         )
     reached = json.loads(asked.stdout)
-    assert reached["heard"] == {"open": "ESTOPPED", "closed": ""}
+    assert reached["states"] == {"open": "ESTOPPED", "closed": ""}
     assert set(reached["found"]) == {"/open"}
     assert "emergency stop" not in closed.log.read_text("utf-8")

@@ -48,9 +48,9 @@ def test_a_training_continues_from_weights_or_a_checkpoint(tmp_path: Path, recor
     output = tmp_path / "net.onnx"
     shutil.copy(WEIGHTS, output)
     before = output.read_bytes()
-    said = trained(tmp_path, "--own", str(recording), "--drawn", "2", "--steps", "40")
-    assert "tips of 21 pairs say where the needle was" in said
-    assert said.count("whole images of such scenes") == 2, "before and after"
+    log_text = trained(tmp_path, "--own", str(recording), "--drawn", "2", "--steps", "40")
+    assert "tips of 21 pairs say where the needle was" in log_text
+    assert log_text.count("whole images of such scenes") == 2, "before and after"
     assert output.read_bytes() != before
     with np.load(tmp_path / "run/scenes/9.npz") as held_out:
         ends = held_out["ends"]

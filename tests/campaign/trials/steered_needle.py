@@ -33,11 +33,11 @@ Hand = Callable[[float], HandState]
 class _SteeredRig(SimRig):
     """Moves the needle, and updates the hand in each cycle."""
 
-    tell: Callable[[SimulatedBench, float], None] = staticmethod(lambda *_: None)
+    update: Callable[[SimulatedBench, float], None] = staticmethod(lambda *_: None)
 
     def _cycle(self, at: Moment) -> Actions:
         yield from super()._cycle(at)
-        self.tell(self._bench, at.steady)
+        self.update(self._bench, at.steady)
 
 
 def steer(
@@ -103,14 +103,14 @@ def steer(
     counts = rig.drives.settings.insertion_counts_per_unit
     path: list[tuple[float, float]] = []
 
-    def tell(bench: SimulatedBench, now: float) -> None:
+    def update(bench: SimulatedBench, now: float) -> None:
         nonlocal before
         rig.hand.state = held = hand(now - begun)
         motor.position += held.push * (now - before) * counts
         before = now
         path.append((bench.insertion, float(bench.tip[0])))
 
-    sim.tell = tell
+    sim.update = update
     while rig.hand.controller.state in _STEERING and rig.runner.now < begun + _LONGEST:
         rig.runner.run(0.1)
     return rig.hand.controller.state, np.array(path)

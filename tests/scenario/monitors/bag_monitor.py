@@ -41,11 +41,11 @@ class BagMonitor:
     def losses_of_ended(self) -> list[str]:
         """Return the losses of a cleanly ended recorder that its bag does not report."""
         kept = _counts(self._bag)
-        told = Counter(json.loads(read_contents(self._bag).custom_data.get(MESSAGES_LOST, "{}")))
+        lost = Counter(json.loads(read_contents(self._bag).custom_data.get(MESSAGES_LOST, "{}")))
         return [
-            f"{topic}: {len(taken)} came, {kept[topic]} are in the bag, {told[topic]} reported lost"
+            f"{topic}: {len(taken)} came, {kept[topic]} are in the bag, {lost[topic]} reported lost"
             for topic, taken in sorted(self._taken.items())
-            if kept[topic] + told[topic] < len(taken)
+            if kept[topic] + lost[topic] < len(taken)
         ]
 
     def losses_of_killed(self, killed_at: float) -> list[str]:

@@ -90,7 +90,7 @@ class InvariantMonitor:
         self.hold_monitor = HoldMonitor()
         self._limits = LimitMonitor(bounds, late)
         self._before: tuple[float, float, float] | None = None
-        self._pressed_until = self._told_until = self._other_until = -1.0
+        self._pressed_until = self._reported_until = self._other_until = -1.0
         self._pressed_since = self._other_since = -1.0
         self._holds = False
         self._page_holds = False
@@ -124,19 +124,19 @@ class InvariantMonitor:
 
     def observe_hold(self, at: float) -> None:
         """Observe a message by which the hand's own node reports a press."""
-        self._told_until = at
+        self._reported_until = at
 
     def observe_page_hold(self, at: float, *, pressed: bool) -> None:
         """Observe whether the console reports a press of the hand at its page."""
         idle = at - self._pressed_until
         if pressed and idle > PAGE_LIFETIME:
-            said = f"reported as held {idle:.3f} s after the finger was off"
-            self.violate("hold_is_of_now", at, said)
+            text = f"reported as held {idle:.3f} s after the finger was off"
+            self.violate("hold_is_of_now", at, text)
         begins = pressed and not self._page_holds
         if begins and self._pressed_since < self._page_ended - PAGE_LIFETIME:
             since, ended = self._pressed_since, self._page_ended
-            said = f"held again by a press of {since:.3f} s; its hold had ended at {ended:.3f} s"
-            self.violate("hold_is_of_now", at, said)
+            text = f"held again by a press of {since:.3f} s; its hold had ended at {ended:.3f} s"
+            self.violate("hold_is_of_now", at, text)
         if self._page_holds and not pressed:
             self._page_ended = at
         self._page_holds = pressed
@@ -227,17 +227,17 @@ class InvariantMonitor:
         if waiting > _WAITING:
             self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
 
-    def observe_belief(self, at: float, status: ControllerStatus, *, joints_heard: bool) -> None:
+    def observe_belief(self, at: float, status: ControllerStatus, *, joints_known: bool) -> None:
         """Observe a published needle/controller_status, while joints reach the controller."""
         # Before its first step the controller has only the earlier position of the needle.
         steers = status.state == "STEERING" and status.step != 0
-        if not (steers and joints_heard) or self._before is None:
+        if not (steers and joints_known) or self._before is None:
             return
         off = self._before[1] - status.insertion_m
         if not -0.0005 <= off <= _BELIEF:
             measured = f"the needle is {self._before[1] * 1e3:.2f} mm in"
-            said = f"the controller says {status.insertion_m * 1e3:.2f} mm, {measured}"
-            self.violate("belief_equals_joints", at, said)
+            text = f"the controller says {status.insertion_m * 1e3:.2f} mm, {measured}"
+            self.violate("belief_equals_joints", at, text)
 
     # ---- checks ---------------------------------------------------------------------------------
 
@@ -250,18 +250,18 @@ class InvariantMonitor:
         if estop is not None and at - estop > self._release_bound:
             self.violate("estop_stops", at, f"motion {at - estop:.3f} s after an emergency stop")
         # The hold lasts while the hand presses and its node reports the press.
-        idle = at - max(min(self._pressed_until, self._told_until), self._other_until)
+        idle = at - max(min(self._pressed_until, self._reported_until), self._other_until)
         if idle > self._release_bound and at > self._ends_until:
-            said = f"motion {idle:.3f} s after the last hold that was pressed and published"
-            self.violate("no_motion_without_hold", at, said)
+            text = f"motion {idle:.3f} s after the last hold that was pressed and published"
+            self.violate("no_motion_without_hold", at, text)
         by_others = self.hold_monitor.idle(at) if self.hold_monitor.has_received else 0.0
         if by_others > RELEASE_BOUND and at > self._ends_until:
-            said = f"motion {by_others:.3f} s after the last press of an owner reached the device"
-            self.violate("no_motion_by_another", at, said)
+            text = f"motion {by_others:.3f} s after the last press of an owner reached the device"
+            self.violate("no_motion_by_another", at, text)
         since, ready = max(self._pressed_since, self._other_since), self._must_press_after
         if begins and since < ready:
-            said = f"motion by a press of {since:.3f} s; the device became ready at {ready:.3f} s"
-            self.violate("no_motion_by_itself", at, said)
+            text = f"motion by a press of {since:.3f} s; the device became ready at {ready:.3f} s"
+            self.violate("no_motion_by_itself", at, text)
 
     def _check_path(self, at: float, insertion: float, rotation: float) -> None:
         """Check that a motion inwards follows one of the last commands."""
@@ -272,11 +272,11 @@ class InvariantMonitor:
         ]
         where = f"at {insertion * 1e3:.2f} mm"
         if not off:
-            said = f"{where} it goes in beyond all of the last commands"
-            self.violate("turns_as_commanded", at, said)
+            text = f"{where} it goes in beyond all of the last commands"
+            self.violate("turns_as_commanded", at, text)
         elif min(off) > _OUT_OF_PROPORTION:
-            said = f"{where} it is {min(off):.2f} rad from the nearest command"
-            self.violate("turns_as_commanded", at, said)
+            text = f"{where} it is {min(off):.2f} rad from the nearest command"
+            self.violate("turns_as_commanded", at, text)
 
     def _check_status(self, at: float) -> None:
         state = self._status.state
@@ -284,8 +284,8 @@ class InvariantMonitor:
             return
         lag = at - max(self._status_at, self._moving_since or at)
         if lag > _STATUS_LAG:
-            said = f"it moves {lag:.3f} s after device/status reported {state}"
-            self.violate("status_is_true", at, said)
+            text = f"it moves {lag:.3f} s after device/status reported {state}"
+            self.violate("status_is_true", at, text)
 
 
 def _rotation_at(insertion: float, command: Sequence[tuple[float, float]]) -> float:

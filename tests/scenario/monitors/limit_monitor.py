@@ -111,7 +111,7 @@ class _Axis:
     set_points: SpeedBudget
     motor: SpeedBudget
 
-    def said(self, distance: float, most: float) -> str:
+    def text(self, distance: float, most: float) -> str:
         """Return a distance and its bound as text."""
         return f"{distance * self.scale:.4g} {self.unit} (at most {most * self.scale:.4g})"
 
@@ -164,7 +164,7 @@ class LimitMonitor:
             return
         ahead, bound = its.set_points.ahead(at, position), its.speed * self._early
         if ahead > bound:
-            yield f"set-points of {its.name} {its.said(ahead, bound)} ahead of its speed limit"
+            yield f"set-points of {its.name} {its.text(ahead, bound)} ahead of its speed limit"
 
     def observe_motors(self, at: float, insertion: float, rotation: float) -> Iterator[str]:
         """Observe the true position of the motors; yields violations of the limits.
@@ -186,4 +186,4 @@ class LimitMonitor:
             # A lagging drive catches up at its full speed (docs/safety.md, following_error).
             ahead = its.motor.ahead(at, position)
             if ahead > its.lag:
-                yield f"{its.name} went {its.said(ahead, its.lag)} farther than its speed allows"
+                yield f"{its.name} went {its.text(ahead, its.lag)} farther than its speed allows"

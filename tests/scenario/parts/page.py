@@ -113,12 +113,12 @@ class Page(Component):
         self._count, self._is_cut = 0, False
         self._retry_at = now + _RETRY
 
-    def _handle_message(self, told: dict[str, object], at: Moment) -> Actions:
+    def _handle_message(self, message: dict[str, object], at: Moment) -> Actions:
         self._retry_at = math.inf
-        self._count = int(str(told["count"]))
+        self._count = int(str(message["count"]))
         self._received_at = at.steady
         # A lost press stays lost until a new one.
-        if self._press and int(str(told["heard"])) > self._press.after and not told["held"]:
+        if self._press and int(str(message["heard"])) > self._press.after and not message["held"]:
             self._drop()
         yield from self._publish_state()
 

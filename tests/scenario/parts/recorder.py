@@ -179,8 +179,8 @@ class RecorderStandIn(Component):
         rows = []
         for output in topics:
             self.recording.add_topic(BagTopic(output.topic, "std_msgs/msg/String", "string data"))
-            hear = partial(self._hear, output.topic)
-            rows.append(Input(output.topic, output.message, hear, output.delivery))
+            receive = partial(self._receive, output.topic)
+            rows.append(Input(output.topic, output.message, receive, output.delivery))
         self.inputs = tuple(rows)
         self.timers = (Timer(_WORK, self._work),)
 
@@ -210,7 +210,7 @@ class RecorderStandIn(Component):
             return self._monitor.losses_of_killed(self._refused_at) if check_killed else []
         return self._monitor.losses_of_ended()
 
-    def _hear(self, topic: str, message: Any, at: Moment) -> Actions:
+    def _receive(self, topic: str, message: Any, at: Moment) -> Actions:
         self._now = at.steady
         self._count += 1
         self._monitor.take(at.steady, topic)

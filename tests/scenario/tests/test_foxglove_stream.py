@@ -86,12 +86,12 @@ class Client:
 
     def subscribe(self, channels: int) -> None:
         while len(self._channels) < channels:
-            told = json.loads(self._connection.recv(timeout=PATIENCE))
-            for channel in told.get("channels", ()):
+            message = json.loads(self._connection.recv(timeout=PATIENCE))
+            for channel in message.get("channels", ()):
                 assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
                 self._channels[channel["id"]] = channel
             # Nothing that a client sends can reach the rig.
-            assert told.get("capabilities", []) == []
+            assert message.get("capabilities", []) == []
         numbers = [{"id": number, "channelId": number} for number in self._channels]
         self._connection.send(json.dumps({"op": "subscribe", "subscriptions": numbers}))
 

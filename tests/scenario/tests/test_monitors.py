@@ -23,12 +23,12 @@ def test_the_speed_budget_covers_all_spans() -> None:
         assert pace.ahead(at, place) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("share", "said"), [(1.0, 0), (-1.0, 0), (1.02, 2), (-1.02, 2)])
-def test_motors_slightly_above_their_speed_limit_are_detected(share: float, said: int) -> None:
-    monitor, told = LimitMonitor(BOUNDS), set()
+@pytest.mark.parametrize(("share", "count"), [(1.0, 0), (-1.0, 0), (1.02, 2), (-1.02, 2)])
+def test_motors_slightly_above_their_speed_limit_are_detected(share: float, count: int) -> None:
+    monitor, names = LimitMonitor(BOUNDS), set()
     for tick in range(4000):
         travel = share * tick * 0.005
         insertion, rotation = 0.12 + BOUNDS.max_speed * travel, BOUNDS.max_rotation_rate * travel
         at = monitor.observe_motors(tick * 0.005, insertion, rotation)
-        told |= {text.split()[0] for text in at if "farther" in text}
-    assert len(told) == said
+        names |= {text.split()[0] for text in at if "farther" in text}
+    assert len(names) == count

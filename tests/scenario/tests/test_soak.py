@@ -47,9 +47,9 @@ def test_an_interrupted_soak_reports_its_progress(
     figures, kept = tmp_path / "soak.json", tmp_path / "failures"
     words = ["--runs", "9", "--json", str(figures), "--failures", str(kept)]
     assert soak.main(words) == EXIT_INTERRUPTED
-    said = capsys.readouterr().out
-    assert "seed 2:\n  1.000 s estop_stops: it went on" in said
-    assert "interrupted: 2 of 9 runs, 1 violate" in said
-    told = json.loads(figures.read_text("utf-8"))
-    assert (told["runs"], told["violations"], told["faults_injected"]) == (2, 1, 1)
+    output = capsys.readouterr().out
+    assert "seed 2:\n  1.000 s estop_stops: it went on" in output
+    assert "interrupted: 2 of 9 runs, 1 violate" in output
+    summary = json.loads(figures.read_text("utf-8"))
+    assert (summary["runs"], summary["violations"], summary["faults_injected"]) == (2, 1, 1)
     assert read_schedule(kept / "seed_2.json") == (2, list(FAULTS))

@@ -68,8 +68,8 @@ class Bench:
     def hold(self, *states: PageHold) -> tuple[list[m.HoldState], list[Call]]:
         """Pass holds in one batch; return the published holds, and the calls."""
         actions = self.handle(*map(HoldRequest, states))
-        said = [one.message for one in actions if isinstance(one, Publish)]
-        return said, [one for one in actions if isinstance(one, Call)]
+        published = [one.message for one in actions if isinstance(one, Publish)]
+        return published, [one for one in actions if isinstance(one, Call)]
 
     def check(self) -> tuple[Diagnose, dict[str, bool]]:
         """Run the check of the console; return the health and the unsubscribed topics."""
@@ -94,16 +94,16 @@ def bench() -> Bench:
 
 
 def test_hold_is_published_with_lifetime_and_release_at_once(bench: Bench) -> None:
-    (said,), calls = bench.hold(INSERT)
-    assert (said.source, said.pressed, said.speed_scale, calls) == ("console", True, 0.5, [])
+    (first,), calls = bench.hold(INSERT)
+    assert (first.source, first.pressed, first.speed_scale, calls) == ("console", True, 0.5, [])
     # As in docs/safety.md. No timer repeats it.
-    assert said.lifetime == m.HOLD_LIFETIME == 0.1
+    assert first.lifetime == m.HOLD_LIFETIME == 0.1
     (released,), _ = bench.hold(RELEASED)
     assert (released.pressed, released.speed_scale) == (False, 0.0)
     # An earlier press of the batch does not count.
     late, _ = bench.hold(INSERT, RELEASED, INSERT)
     assert [hold.pressed for hold in late] == [False, True]
-    assert [hold.count for hold in (said, released, *late)] == [1, 2, 3, 4]
+    assert [hold.count for hold in (first, released, *late)] == [1, 2, 3, 4]
 
 
 def test_retraction_waits_for_the_end_of_steering(bench: Bench) -> None:
@@ -114,8 +114,8 @@ def test_retraction_waits_for_the_end_of_steering(bench: Bench) -> None:
     ):
         bench.receive("needle/controller_status", ControllerStatus(state=controller))
         bench.receive("device/status", DeviceStatus(hold_owner=owner))
-        (said,), made = bench.hold(RETRACT)
-        assert (said.pressed, made) == (pressed, calls)
+        (published,), made = bench.hold(RETRACT)
+        assert (published.pressed, made) == (pressed, calls)
 
 
 def test_buttons_call_their_services_and_answers_are_shown(bench: Bench) -> None:

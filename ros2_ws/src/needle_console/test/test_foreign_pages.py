@@ -56,19 +56,19 @@ def test_other_machines_need_a_host_name() -> None:
 
 def asked(*headers: tuple[str, str], kind: str = "http", method: str = "GET") -> dict[str, Any]:
     """Return the first answer of the gate, or of the page behind it."""
-    said: list[dict[str, Any]] = []
+    sent: list[dict[str, Any]] = []
 
     async def page(scope: Any, receive: Any, send: Any) -> None:
         await send({"type": "http.response.start", "status": 200, "headers": [(b"a", b"b")]})
 
     async def send(message: Any) -> None:
-        said.append(dict(message))
+        sent.append(dict(message))
 
     pairs = [(name.encode(), value.encode()) for name, value in headers]
     scope = {"type": kind, "method": method, "path": "/", "headers": pairs}
     nothing: Any = None
     asyncio.run(Gate(page, LOOPBACK)(scope, nothing, send))
-    return said[0]
+    return sent[0]
 
 
 def test_gate_refuses_foreign_pages_and_missing_origins() -> None:

@@ -122,8 +122,8 @@ def test_it_steers_in_steps_and_publishes_its_estimate() -> None:
     rate = bench.published["needle/control_input"][-1].values[1]
     before = bench.published[COMMANDS][-2].points[0].positions[1]
     assert point.positions[1] - before == pytest.approx(rate * 0.001)
-    heard = [one for s in bench.published[STATUS] for one in received_messages(s.heard)]
-    assert [one.topic for one in heard[-2:]] == ["joint_states", "device/result"]
+    received = [one for s in bench.published[STATUS] for one in received_messages(s.heard)]
+    assert [one.topic for one in received[-2:]] == ["joint_states", "device/result"]
     assert bench.call("stop") == (True, "stopped")
     assert bench.status.state == "IDLE"
 
@@ -190,13 +190,13 @@ def test_a_measured_heading_reaches_the_estimator_in_the_target_plane(
     settings = dataclasses.replace(
         SETTINGS, tip_covariance="from_tip_pose", measured_heading=is_used
     )
-    bench, told = Bench(settings).started(), list[tuple[float, ...]]()
+    bench, headings = Bench(settings).started(), list[tuple[float, ...]]()
     plane = (0.0, 0.0, math.sin(0.2), math.cos(0.2))
     bench.receive("target_plane", m.Pose(0, "rig", (0.0, 0.0, 0.0), plane))
     monkeypatch.setattr(
         bench.component.steering.control._estimator,
         "correct_heading",
-        lambda direction, variance: told.append((*direction, variance)),
+        lambda direction, variance: headings.append((*direction, variance)),
     )
     half, std = 0.05, 0.02
     # A turn about y; the roll is unknown.
@@ -210,8 +210,8 @@ def test_a_measured_heading_reaches_the_estimator_in_the_target_plane(
     for message in (pose, pose, unknown):
         bench.step(message)
     wanted = [direction[0] * math.cos(0.4), -direction[0] * math.sin(0.4), direction[2]]
-    assert len(told) == is_used
-    for row in told:
+    assert len(headings) == is_used
+    for row in headings:
         np.testing.assert_allclose(row, [*wanted, 10.0 * std**2], atol=1e-9)
 
 
@@ -236,9 +236,9 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
     plane = m.Pose(0, "rig", (0.005, 0.0, 0.0), STRAIGHT)
     bench.receive("target_plane", plane)
     assert bench.status.target_offset_m == 0.005
-    for bad, said in (((np.nan, 0.0, 0.0), "not finite"), ((0.5, 0.0, 0.0), "cannot be reached")):
+    for bad, cause in (((np.nan, 0.0, 0.0), "not finite"), ((0.5, 0.0, 0.0), "cannot be reached")):
         bench.receive("target_plane", dataclasses.replace(plane, position=bad))
-        assert said in bench.health["target_plane"].message
+        assert cause in bench.health["target_plane"].message
     assert "keeping the last plane" in bench.component.problems["target_plane"]
     assert bench.status.target_offset_m == 0.005
     for x, z in ((0.01, 0.1), (0.09, 0.1)):

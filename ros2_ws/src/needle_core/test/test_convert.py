@@ -66,8 +66,8 @@ def test_a_message_round_trips_with_and_without_ros_and_across(message: Any) -> 
     if importlib.util.find_spec(kind.partition("/")[0]) is not None:
         types = rclpy_types()
         for data in (serialize_message(Converter(types).to_ros(message)), bytes(written)):
-            heard = deserialize_message(data, types.make(kind))
-            assert from_ros(type(message), heard) == message
+            received = deserialize_message(data, types.make(kind))
+            assert from_ros(type(message), received) == message
 
 
 def test_a_plain_marker_looks_like_an_obstacle() -> None:

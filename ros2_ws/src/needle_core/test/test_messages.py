@@ -9,8 +9,8 @@ from needle_core.messages import HOLD_LIFETIME, HoldSession, HoldState
 
 def test_a_session_counts_independently_of_the_clock() -> None:
     session = HoldSession("operator")
-    said = [session.next_message(stamp, pressed=stamp > 5, speed=0.5) for stamp in (255, 7, 3)]
-    assert said == [
+    holds = [session.next_message(stamp, pressed=stamp > 5, speed=0.5) for stamp in (255, 7, 3)]
+    assert holds == [
         HoldState("operator", "ff", 1, True, 0.5, HOLD_LIFETIME),
         HoldState("operator", "ff", 2, True, 0.5, HOLD_LIFETIME),
         HoldState("operator", "ff", 3, False, 0.0, HOLD_LIFETIME),

@@ -20,8 +20,8 @@ def test_a_malformed_value_keeps_its_default() -> None:
 
 
 def test_simulated_is_true_only_if_given() -> None:
-    said = {text: DeviceStatus.parse({"simulated": text}).simulated for text in ("true", "", "yes")}
-    assert said == {"true": True, "": None, "yes": False}
+    parsed = {one: DeviceStatus.parse({"simulated": one}).simulated for one in ("true", "", "yes")}
+    assert parsed == {"true": True, "": None, "yes": False}
 
 
 def test_unknown_keys_are_ignored() -> None:

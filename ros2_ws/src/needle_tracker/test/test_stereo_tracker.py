@@ -58,7 +58,7 @@ class Bench:
             elif isinstance(action, Log):
                 self.logs.append(action.text)
 
-    def hear(self, topic: str, message: Any) -> None:
+    def receive(self, topic: str, message: Any) -> None:
         self.do(self.handlers[topic](message, Moment(self.now, 0)))
 
     def check(self, now: float = 0.0) -> None:
@@ -66,13 +66,13 @@ class Bench:
         self.do(self.tracker.check(Moment(now, 0)))
 
     def joints(self, stamp: int, insertion: float = 0.05, name: str = "insertion_joint") -> None:
-        self.hear("joint_states", m.JointState(stamp, (name,), (insertion,)))
+        self.receive("joint_states", m.JointState(stamp, (name,), (insertion,)))
 
     def image(self, side: str, stamp: int, pixels: Any = PIXELS, **fields: Any) -> None:
         height, width = pixels.shape
         data = pixels.tobytes()
         image = m.Image(stamp, "", height, width, "mono8", width, data)
-        self.hear(f"stereo/{side}/image_raw", dataclasses.replace(image, **fields))
+        self.receive(f"stereo/{side}/image_raw", dataclasses.replace(image, **fields))
 
     def pair(self, stamp: int, left: Any = PIXELS, right: Any = PIXELS, **fields: Any) -> bool:
         """Send a joint state and a pair; return whether the answer is a tip."""
@@ -85,7 +85,7 @@ class Bench:
         assert np.all(np.isfinite(diagonal)) or np.all(np.isinf(diagonal))
         return bool(np.all(np.isfinite(diagonal)))
 
-    def said(self, part: str) -> tuple[Level, str]:
+    def reported(self, part: str) -> tuple[Level, str]:
         return self.health[part].level, self.health[part].message
 
 
@@ -125,9 +125,9 @@ def test_a_pair_gives_tip_and_pose_with_the_stamp_of_the_exposure(
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
     assert np.all(np.linalg.eigvalsh(covariance) > -1e-15)
     assert covariance[:3, :3].trace() < 1e-6
-    assert bench.said("track") == (Level.OK, "TRACKING")
-    assert bench.said("images") == (Level.OK, "pairs complete")
-    assert bench.said("joints") == (Level.OK, "insertion known")
+    assert bench.reported("track") == (Level.OK, "TRACKING")
+    assert bench.reported("images") == (Level.OK, "pairs complete")
+    assert bench.reported("joints") == (Level.OK, "insertion known")
     assert not bench.logs
 
 
@@ -144,7 +144,7 @@ def test_bad_images_give_no_tip_and_are_reported(
     bench: Bench, fields: dict[str, Any], reason: str
 ) -> None:
     assert not bench.pair(10, **fields)
-    level, message = bench.said("images")
+    level, message = bench.reported("images")
     assert level is Level.ERROR
     assert message.startswith(f"pair refused: {reason}")
     assert bench.health["images"].values["pairs_refused"] == "1"
@@ -152,15 +152,15 @@ def test_bad_images_give_no_tip_and_are_reported(
     assert not bench.sent["needle/tip"]
     assert bench.pair(20)
     bench.check(6.0)
-    assert bench.said("images") == (Level.OK, "pairs complete")
+    assert bench.reported("images") == (Level.OK, "pairs complete")
 
 
 def test_time_running_backwards_gives_no_tip(bench: Bench) -> None:
     assert bench.pair(5 * SECOND)
     assert not bench.pair(5 * SECOND - 1000)
-    assert "ran backwards" in bench.said("images")[1]
+    assert "ran backwards" in bench.reported("images")[1]
     assert not bench.pair(5 * SECOND)
-    assert "repeated" in bench.said("images")[1]
+    assert "repeated" in bench.reported("images")[1]
     assert bench.pair(5 * SECOND + 1000)
     # A large step back is a new recording: its first pair is rejected, the next processed.
     assert not bench.pair(SECOND)
@@ -204,32 +204,32 @@ def test_a_camera_that_runs_at_another_resolution_gives_no_tip(
 ) -> None:
     topic, camera = "stereo/left/camera_info", calibration.left
     sensor = dataclasses.replace(camera, width=2048, height=1536, camera_matrix=np.zeros((3, 3)))
-    bench.hear(topic, info(sensor, {"binning_x": 4, "binning_y": 2}))
+    bench.receive(topic, info(sensor, {"binning_x": 4, "binning_y": 2}))
     bench.check()
     reason = "left camera_info is for 512x768"
-    assert bench.said("images") == (Level.ERROR, f"{reason}, the calibration for 1024x768")
+    assert bench.reported("images") == (Level.ERROR, f"{reason}, the calibration for 1024x768")
     assert not bench.pair(10)
-    assert bench.said("images")[1].startswith(f"pair refused: {reason}")
+    assert bench.reported("images")[1].startswith(f"pair refused: {reason}")
     # A sensor larger than its images, and a driver without data, are no contradiction.
     unknown = dataclasses.replace(sensor, width=0, height=0)
     for number, message in enumerate(
         (info(sensor, {"binning_x": 2, "binning_y": 2}), info(unknown, {}))
     ):
-        bench.hear(topic, message)
+        bench.receive(topic, message)
         assert bench.pair(20 + number)
 
 
 def test_images_without_a_partner_are_reported(bench: Bench) -> None:
     bench.check()
-    assert bench.said("images") == (Level.WARN, "no images yet")
+    assert bench.reported("images") == (Level.WARN, "no images yet")
     bench.image("left", 1)
     bench.check(0.6)
-    assert bench.said("images") == (Level.WARN, "left images without right")
+    assert bench.reported("images") == (Level.WARN, "left images without right")
     for stamp in range(2, 6):
         bench.image("left", stamp)
     bench.image("right", 99)
     bench.check(0.7)
-    assert bench.said("images") == (Level.WARN, "images without a partner were dropped")
+    assert bench.reported("images") == (Level.WARN, "images without a partner were dropped")
     values = bench.health["images"].values
     assert (values["left_without_right"], values["pairs"]) == ("2", "0")
     assert not bench.sent["needle/tip_pose"]
@@ -239,42 +239,42 @@ def test_useless_joint_states_are_counted_and_silence_is_a_warning(bench: Bench)
     bench.joints(1, name="rotation_joint")
     bench.joints(1, math.nan)
     bench.check()
-    assert bench.said("joints") == (Level.OK, "no joint states yet")
+    assert bench.reported("joints") == (Level.OK, "no joint states yet")
     bench.image("left", 5)
     bench.image("right", 5)
     assert not bench.sent["needle/tip_pose"]
     bench.check(1.0)
     assert len(bench.sent["needle/tip_pose"]) == 1
-    assert bench.said("joints")[0] is Level.WARN
+    assert bench.reported("joints")[0] is Level.WARN
     values = bench.health["joints"].values
     assert (values["without_insertion_joint"], values["not_finite"]) == ("1", "1")
     bench.joints(10)
     bench.check(1.0)
-    assert bench.said("joints") == (Level.OK, "insertion known")
+    assert bench.reported("joints") == (Level.OK, "insertion known")
 
 
 def test_images_stamped_by_another_clock_than_joint_states_are_a_warning(bench: Bench) -> None:
     bench.joints(10 * SECOND)
-    for stamp, said in (
+    for stamp, expected in (
         (9 * SECOND, (Level.OK, "insertion known")),
         (9 * SECOND - 1, (Level.WARN, "no pair is processed: exposed 1.0 s before the first")),
     ):
         bench.image("left", stamp)
         bench.image("right", stamp)
         bench.check()
-        level, message = bench.said("joints")
-        assert (level, message[: len(said[1])]) == said
+        level, message = bench.reported("joints")
+        assert (level, message[: len(expected[1])]) == expected
     assert bench.health["joints"].values["pairs_before_joint_states"] == "2"
     assert not bench.sent["needle/tip_pose"]
     assert bench.pair(11 * SECOND)
-    assert bench.said("joints") == (Level.OK, "insertion known")
+    assert bench.reported("joints") == (Level.OK, "insertion known")
 
 
 def test_swapped_images_are_a_warning(bench: Bench) -> None:
     bench.measured = NOT_FOUND
     bench.tracker.answers.swap.suspected = True
     assert not bench.pair(10)
-    level, message = bench.said("images")
+    level, message = bench.reported("images")
     assert level is Level.WARN
     assert "seem to be swapped" in message
     assert "parameters left and right" in message
@@ -300,7 +300,7 @@ def test_pictures_are_drawn_for_subscribers_at_a_limited_rate(make: Make) -> Non
 def test_bad_parameters_are_rejected_and_the_installed_calibration_is_the_default(
     calibration_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, value, said in (
+    for name, value, cause in (
         ("calibration_file", "/nowhere/rig.yaml", "/nowhere/rig.yaml"),
         ("calibration_file", __file__, "not YAML in line"),
         ("pair_tolerance", -1.0, "pair_tolerance"),
@@ -308,7 +308,7 @@ def test_bad_parameters_are_rejected_and_the_installed_calibration_is_the_defaul
         ("hole_clearance", 0.05, "hole_clearance = 0.05 m"),
         ("stage_scale_sigma", 0.5, "stage_scale_sigma"),
     ):
-        with pytest.raises(UserError, match=said) as caught:
+        with pytest.raises(UserError, match=cause) as caught:
             make_tracker(StereoTrackerParameters(**{name: value}))  # type: ignore[arg-type]
         assert "\n" not in str(caught.value)
     monkeypatch.setattr(

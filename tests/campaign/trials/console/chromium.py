@@ -65,7 +65,7 @@ class Chromium:
         self._open = contextlib.ExitStack()
         self._open.callback(self.kill)
         try:
-            port, endpoint = self._said(folder / "DevToolsActivePort").split()
+            port, endpoint = self._contents(folder / "DevToolsActivePort").split()
             self._socket = self._open.enter_context(
                 connect(f"ws://127.0.0.1:{port}{endpoint}", compression=None, max_size=None)
             )
@@ -130,7 +130,7 @@ class Chromium:
         self.kill()
         self._open.close()
 
-    def _said(self, file: Path) -> str:
+    def _contents(self, file: Path) -> str:
         deadline = time.monotonic() + _PATIENCE
         while True:
             with contextlib.suppress(FileNotFoundError):

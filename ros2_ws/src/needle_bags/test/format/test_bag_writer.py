@@ -48,8 +48,8 @@ def texts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bag of 200 texts that uses every feature of the format."""
     directory = tmp_path_factory.mktemp("writer") / "bag"
     bag = BagWriter(directory, chunk_size=4096)
-    told: Any = {"reliability": QosReliability.BEST_EFFORT, "lifespan": QosTime(10, 7)}
-    latched = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL, **told)
+    offered: Any = {"reliability": QosReliability.BEST_EFFORT, "lifespan": QosTime(10, 7)}
+    latched = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL, **offered)
     offers = (USUAL_QOS._replace(depth=10), latched)
     channel = bag.add_topic(dataclasses.replace(TOPIC, offered_qos=offers))
     for number in range(200):
@@ -187,18 +187,18 @@ def test_a_recording_keeps_room_for_small_messages_and_counts_dropped_ones(tmp_p
 
 def test_health_reports_the_worst_problem() -> None:
     space = SimpleNamespace(reserve=1_000_000, usable=lambda: 10**9)
-    told: Any = SimpleNamespace(error=None, bytes_received=0, bytes_waiting=0, space=space)
-    health = RecorderHealth(told, Path("bag"))
+    writer: Any = SimpleNamespace(error=None, bytes_received=0, bytes_waiting=0, space=space)
+    health = RecorderHealth(writer, Path("bag"))
     assert health.check(0.5, {}, []) == (Level.OK, "recording")
     assert health.check(0.5, {}, ["/odd is not recorded"]) == (Level.WARN, "/odd is not recorded")
     # At 10 MB/s, 120 s of data exceed the free space.
     for _ in range(4):
-        told.bytes_received += 5_000_000
+        writer.bytes_received += 5_000_000
         level, text = health.check(0.5, {}, [])
     assert level is Level.WARN
     assert text == "the disk of bag is nearly full: recording stops at 1 MB free"
-    told.bytes_waiting = WARN_WAITING + 1
+    writer.bytes_waiting = WARN_WAITING + 1
     assert "slower than the graph: 50 MB wait" in health.check(0.5, {}, [])[1]
     assert health.check(0.5, {"/t": 3}, []) == (Level.WARN, "messages lost on /t")
-    told.error = "broken"
+    writer.error = "broken"
     assert health.check(0.5, {"/t": 3}, []) == (Level.ERROR, "recording ended: broken")

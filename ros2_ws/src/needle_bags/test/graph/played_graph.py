@@ -98,7 +98,7 @@ class PlayedGraph:
         self.unmatched: set[str] = set()
         self.subscriptions: list[PlayedSubscription] = []
         self.publishers: list[Any] = []
-        self.heard: dict[str, list[Any]] = defaultdict(list)
+        self.published: dict[str, list[Any]] = defaultdict(list)
         self.clients: list[PlayedClient] = []
         self.services: dict[str, Callable[[Any, Any], Any]] = {}
         self.logged: list[str] = []
@@ -150,7 +150,7 @@ class PlayedGraph:
     def _publisher(self, _: type, topic: str, qos: Any) -> Any:
         name = self.remaps.get(topic, topic)
         made = Stub(topic_name=name, qos=qos, wait_for_all_acked=lambda _: True)
-        made.publish = lambda message: self.heard[name].append(message)  # noqa: PLW0108
+        made.publish = lambda message: self.published[name].append(message)  # noqa: PLW0108
         made.get_subscription_count = lambda: (
             (name not in self.unmatched) * len(self.requests[name])
         )
@@ -176,8 +176,8 @@ class PlayedGraph:
 
     def _endpoint(self, topic: str, kind: type, qos: QoSProfile, node: str) -> Any:
         self.types[topic] = type_name(kind)
-        told = STORE.hash_rihs01(self.types[topic])
-        return Stub(qos_profile=qos, node_name=node, topic_type_hash=told)
+        type_hash = STORE.hash_rihs01(self.types[topic])
+        return Stub(qos_profile=qos, node_name=node, topic_type_hash=type_hash)
 
     def send(self, topic: str, *messages: Any) -> None:
         """Deliver messages, or bytes, to every subscription of a topic."""

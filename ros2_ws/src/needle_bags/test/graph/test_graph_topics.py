@@ -35,15 +35,15 @@ class Graph(PlayedGraph):
             lambda message: self.numbers.append(int(message.data)),
         )
 
-    def hear(self, subscription: PlayedSubscription, *numbers: int) -> None:
+    def receive(self, subscription: PlayedSubscription, *numbers: int) -> None:
         for number in numbers:
             subscription.take(*sent(number))
 
-    def replace(self, *heard: int) -> tuple[PlayedSubscription, PlayedSubscription]:
+    def replace(self, *received: int) -> tuple[PlayedSubscription, PlayedSubscription]:
         """Return a subscription that has received some numbers, and its replacement."""
         self.offer(JOINTS, Int32)
         self.topics.poll()
-        self.hear(self.subscriptions[0], *heard)
+        self.receive(self.subscriptions[0], *received)
         self.offer(JOINTS, Int32, BEST_EFFORT)
         self.topics.poll()
         before, following = self.subscriptions
@@ -62,10 +62,10 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
 
 def test_duplicates_of_two_subscriptions_are_dropped(graph: Graph) -> None:
     before, following = graph.replace(1, 2)
-    graph.hear(following, 1, 2, 3)
+    graph.receive(following, 1, 2, 3)
     for number in range(4, 8):
         for subscription in (before, following) if number % 2 else (following, before):
-            graph.hear(subscription, number)
+            graph.receive(subscription, number)
         assert graph.numbers == list(range(1, number + 1))
 
 
@@ -73,26 +73,26 @@ def test_a_replaced_subscription_delivers_its_queue_before_its_end(graph: Graph)
     before, following = graph.replace()
     graph.now += OVERLAP
     graph.topics.poll()
-    graph.hear(before, 1)
+    graph.receive(before, 1)
     before.waiting.append(sent(2))
     assert graph.subscriptions == [before, following]
     graph.now += 0.1
     graph.topics.poll()
     assert (graph.numbers, graph.subscriptions) == ([1, 2], [following])
-    graph.hear(following, 2, 3)
+    graph.receive(following, 2, 3)
     assert graph.numbers == [1, 2, 3]
 
 
 def test_a_third_subscription_keeps_the_messages_of_the_first_two(graph: Graph) -> None:
     before, following = graph.replace()
-    graph.hear(before, 1)
-    graph.hear(following, 2)
+    graph.receive(before, 1)
+    graph.receive(following, 2)
     graph.offers[JOINTS].pop()
     graph.topics.poll()
     assert graph.subscriptions[0] is following
     third = graph.subscriptions[1]
     following.waiting.append(sent(3))
-    graph.hear(third, 3, 4)
+    graph.receive(third, 3, 4)
     graph.now += OVERLAP + 0.1
     graph.topics.poll()
     assert (graph.numbers, graph.subscriptions) == ([1, 2, 3, 4], [third])
@@ -132,7 +132,7 @@ def test_losses_and_unrecordable_topics_are_reported(graph: Graph) -> None:
     (topic,) = graph.described
     assert (topic.name, topic.type_name) == (JOINTS, "std_msgs/msg/Int32")
     (subscription,) = graph.subscriptions
-    graph.hear(subscription, 1, 2, 5, *range(6, 20))
+    graph.receive(subscription, 1, 2, 5, *range(6, 20))
     assert graph.topics.lost == {JOINTS: 2}
     subscription.lost(SimpleNamespace(total_count=7))
     assert graph.topics.lost == {JOINTS: 7}

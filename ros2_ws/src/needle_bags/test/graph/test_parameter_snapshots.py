@@ -68,11 +68,11 @@ def test_a_slow_node_is_asked_ever_less_often_until_it_disappears(bench: Bench) 
 
 def test_changes_are_those_after_the_snapshot(bench: Bench) -> None:
     def event(**values: object) -> ParameterEvent:
-        told = ParameterEvent(node=OTHER)
-        told.stamp.sec = 2
+        message = ParameterEvent(node=OTHER)
+        message.stamp.sec = 2
         changes = [Parameter(name, value=value) for name, value in values.items()]
-        told.changed_parameters = [change.to_parameter_msg() for change in changes]
-        return told
+        message.changed_parameters = [change.to_parameter_msg() for change in changes]
+        return message
 
     assert bench.snapshots.apply_event(event(gain=1.0)) == []
     bench.answer_all()

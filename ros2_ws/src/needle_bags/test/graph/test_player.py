@@ -57,11 +57,11 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer = BagWriter(path)
     numbers = {}
     for name, (kind, qos) in OFFERS.items():
-        told = type_name(kind)
-        topic = BagTopic(name, told, full_definition(told), STORE.hash_rihs01(told), (qos,))
+        label = type_name(kind)
+        topic = BagTopic(name, label, full_definition(label), STORE.hash_rihs01(label), (qos,))
         numbers[name] = writer.add_topic(topic)
-    for name, told in OTHERWISE.items():
-        unknown = writer.add_topic(BagTopic(name, told, "uint32 seq\n"))
+    for name, label in OTHERWISE.items():
+        unknown = writer.add_topic(BagTopic(name, label, "uint32 seq\n"))
         writer.write(unknown, bytes([0, 1, 0, 0, 0, 0, 0, 0]), START, START)
     for second in range(COUNT):
         for name, (kind, _) in OFFERS.items():
@@ -114,7 +114,7 @@ class Scene(PlayedGraph):
         self.at(0.0, look)
 
     def numbers(self, topic: str) -> list[int]:
-        return [deserialize_message(data, Int32).data for data in self.heard[topic]]
+        return [deserialize_message(data, Int32).data for data in self.published[topic]]
 
     def offered(self) -> set[str]:
         return {one.topic_name for one in self.publishers} - {"/diagnostics"}
@@ -134,8 +134,8 @@ def test_topics_that_control_a_rig_are_not_played(
     assert scene.now - begin == pytest.approx(node.DISCOVERY + COUNT - 1, abs=0.2)
     assert scene.numbers("/numbered") == scene.numbers("/noisy") == list(range(COUNT))
     for topic in GUARDED:
-        assert topic not in scene.heard
-        assert len(scene.heard[f"/replay{topic}"]) == COUNT
+        assert topic not in scene.published
+        assert len(scene.published[f"/replay{topic}"]) == COUNT
     assert not scene.offered() & GUARDED.keys()
     qos = {one.topic_name: one.qos for one in scene.publishers}
     assert qos["/plane"].durability == DurabilityPolicy.TRANSIENT_LOCAL
@@ -153,7 +153,7 @@ def test_part_of_a_bag_under_another_name_at_another_rate(scene: Scene) -> None:
     assert scene.offered() == {"/other", "/clock"}
     assert scene.now - begin == pytest.approx(node.DISCOVERY + 10.0, abs=0.2)
     # /clock has the recorded time, at 10 Hz of wall time.
-    stamps = [message.clock.sec for message in scene.heard["/clock"]]
+    stamps = [message.clock.sec for message in scene.published["/clock"]]
     assert 80 < len(stamps) <= 101
     assert stamps[-1] - START // 10**9 == pytest.approx(7, abs=1)
 
@@ -161,8 +161,8 @@ def test_part_of_a_bag_under_another_name_at_another_rate(scene: Scene) -> None:
 def test_latched_messages_are_available_while_paused_and_loops_repeat(scene: Scene) -> None:
     def begin() -> None:
         # The latched message was recorded before --start, but late subscribers still receive it.
-        assert len(scene.heard["/plane"]) == 1
-        assert scene.heard["/numbered"] == []
+        assert len(scene.published["/plane"]) == 1
+        assert scene.published["/numbered"] == []
         assert scene.pause(False) == "playing"
 
     def stop() -> None:
@@ -171,9 +171,9 @@ def test_latched_messages_are_available_while_paused_and_loops_repeat(scene: Sce
     scene.at(9.0, begin)
     scene.at(9.0 + 2.5 * (COUNT - 5), stop)
     assert scene.play("--paused --loop --start 5") == 0
-    heard = scene.numbers("/numbered")
-    assert heard[: 2 * COUNT - 9] == [*range(5, COUNT), *range(5, COUNT), 5][: 2 * COUNT - 9]
-    assert len(heard) > 2 * COUNT - 10
+    published = scene.numbers("/numbered")
+    assert published[: 2 * COUNT - 9] == [*range(5, COUNT), *range(5, COUNT), 5][: 2 * COUNT - 9]
+    assert len(published) > 2 * COUNT - 10
 
 
 def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
@@ -188,7 +188,7 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     assert scene.numbers("/numbered") == [0, 15, 4, 4, 5, *range(11, COUNT)]
     assert scene.offered() == {"/numbered", "/plane", "/replay/target_plane"}
     # Each jump republishes the latched message for new subscribers.
-    assert len(scene.heard["/plane"]) == 1 + 4
+    assert len(scene.published["/plane"]) == 1 + 4
 
 
 def test_beside_a_rig_everything_is_played_under_replay(scene: Scene) -> None:
@@ -197,7 +197,7 @@ def test_beside_a_rig_everything_is_played_under_replay(scene: Scene) -> None:
     assert any("playing under /replay" in line for line in scene.logged)
     assert all(topic.startswith("/replay/") for topic in scene.offered())
     assert scene.numbers("/replay/numbered") == list(range(COUNT))
-    assert not scene.heard.keys() - {"/diagnostics"} - scene.offered()
+    assert not scene.published.keys() - {"/diagnostics"} - scene.offered()
 
 
 def test_a_rig_that_appears_ends_the_playback(
@@ -223,7 +223,7 @@ def test_a_ros_remapping_cannot_reach_a_rig(
         scene.remaps = {played: remapped}
         assert scene.play() == 2
         assert f"as {remapped}: a rig would execute it" in capsys.readouterr().err
-        assert scene.heard.keys() <= {"/diagnostics"}
+        assert scene.published.keys() <= {"/diagnostics"}
 
 
 def test_the_player_waits_for_existing_subscribers(scene: Scene) -> None:

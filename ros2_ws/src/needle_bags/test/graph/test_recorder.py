@@ -86,8 +86,8 @@ class Scene(PlayedGraph):
 
     def health(self, part: str) -> DiagnosticStatus:
         """Return the last reported status of a part."""
-        told = [s for message in self.heard["/diagnostics"] for s in message.status]
-        return [s for s in told if s.name == f"recorder: {part}"][-1]
+        statuses = [s for message in self.published["/diagnostics"] for s in message.status]
+        return [s for s in statuses if s.name == f"recorder: {part}"][-1]
 
     def numbers(self, topic: str) -> list[int]:
         return [message.data for _, _, message in read_messages(self.bag, topic.__eq__)]
@@ -165,9 +165,9 @@ def test_a_full_disk_ends_the_recording_and_not_the_node(
         scene.run(0.5)
 
     assert scene.record(act) == 1
-    said = scene.health("bag")
-    assert said.level == DiagnosticStatus.ERROR
-    assert f"cannot write {scene.bag}/bag_0.mcap: No space left on device" in said.message
+    status = scene.health("bag")
+    assert status.level == DiagnosticStatus.ERROR
+    assert f"cannot write {scene.bag}/bag_0.mcap: No space left on device" in status.message
     assert sum("recording ended" in line for line in scene.logged) == 1
     errors = capsys.readouterr().err
     assert f"`ros2 run needle_bags recover {scene.bag}`" in errors

@@ -31,7 +31,7 @@ from plus_messages import message as link_message
 TIP = (0.001, 0.002, 0.04)
 TURN = Rotation.from_euler("xyz", (0.1, 0.2, 0.3))
 AT = Moment(0.0, 7_000_000_000)
-Said = dict[str, tuple[Any, float]]
+Packed = dict[str, tuple[Any, float]]
 
 
 class Played:
@@ -40,10 +40,10 @@ class Played:
     def __init__(self, *given: Any, **named: Any) -> None:
         # A POLYDATA has the points first, then the lines.
         content, *_, time, name = (*given, *named.values())
-        self._said = [name, np.asarray(content).tolist(), time]
+        self._content = [name, np.asarray(content).tolist(), time]
 
     def pack(self) -> bytes:
-        return json.dumps(self._said).encode() + b"\n"
+        return json.dumps(self._content).encode() + b"\n"
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def component(monkeypatch: pytest.MonkeyPatch) -> OpenIGTLink:
     return one
 
 
-def says(component: OpenIGTLink) -> Said:
+def packed(component: OpenIGTLink) -> Packed:
     (action,) = component.timers[0].handler(AT)
     assert isinstance(action, Send)
     assert action.port == LINK
@@ -67,7 +67,7 @@ def says(component: OpenIGTLink) -> Said:
     return {name: (content, time) for name, content, time in map(json.loads, lines)}
 
 
-def hear(component: OpenIGTLink, topic: str, message: Any) -> None:
+def receive(component: OpenIGTLink, topic: str, message: Any) -> None:
     (row,) = (row for row in component.inputs if row.topic == topic)
     list(row.handler(message, AT))
 
@@ -79,56 +79,56 @@ def pose(stamp_ns: int, sigma: float = 1e-4) -> m.PoseWithCovariance:
 
 
 def test_messages_are_in_mm(component: OpenIGTLink) -> None:
-    assert says(component) == {"NeedleStatus": ("no needle data received", 7.0)}
+    assert packed(component) == {"NeedleStatus": ("no needle data received", 7.0)}
     status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
-    hear(component, "needle/controller_status", status)
-    hear(component, "joint_states", m.JointState(1, ("insertion_joint",), (0.04,)))
-    hear(component, "needle/tip_pose", pose(5_250_000_000))
+    receive(component, "needle/controller_status", status)
+    receive(component, "joint_states", m.JointState(1, ("insertion_joint",), (0.04,)))
+    receive(component, "needle/tip_pose", pose(5_250_000_000))
     # In the frame of the plane, offset by 3 mm.
-    hear(component, "needle/estimate", pose(5_250_000_000))
-    said = says(component)
-    assert said["NeedleStatus"][0] == "tip found"
-    plane, time = said["TargetPlaneToRig"]
+    receive(component, "needle/estimate", pose(5_250_000_000))
+    messages = packed(component)
+    assert messages["NeedleStatus"][0] == "tip found"
+    plane, time = messages["TargetPlaneToRig"]
     np.testing.assert_allclose(np.array(plane)[:3, 3], [3.0, 0.0, 0.0])
     assert time == pytest.approx(7.0)
-    (target,) = said["NeedleTarget"][0]
+    (target,) = messages["NeedleTarget"][0]
     assert target == pytest.approx([10.0, 0.0, 100.0])
-    tip, time = said["NeedleTipToRig"]
+    tip, time = messages["NeedleTipToRig"]
     np.testing.assert_allclose(np.array(tip)[:3, 3], np.array(TIP) * 1e3, rtol=1e-6)
     np.testing.assert_allclose(np.array(tip)[:3, :3], TURN.as_matrix(), atol=1e-6)
     assert time == pytest.approx(5.25)
-    shaft = said["NeedleShaft"][0]
+    shaft = messages["NeedleShaft"][0]
     assert (shaft[0], shaft[-1]) == ([0.0] * 3, pytest.approx(np.array(TIP) * 1e3))
-    estimate = np.array(said["NeedleEstimateToRig"][0])
+    estimate = np.array(messages["NeedleEstimateToRig"][0])
     np.testing.assert_allclose(estimate[:3, 3], [4.0, 2.0, 40.0], rtol=1e-6)
     # The shape follows the estimates.
-    shape, time = said["NeedleShape"]
+    shape, time = messages["NeedleShape"]
     assert (shape[0], shape[-1]) == ([0.0] * 3, pytest.approx([4.0, 2.0, 40.0]))
     assert time == pytest.approx(5.25)
     # A plan belongs to one estimate.
-    hear(component, "needle/planned_path", m.Path(4, "rig", ((0.0, 0.0, 0.1),)))
-    assert "NeedlePlan" not in says(component)
+    receive(component, "needle/planned_path", m.Path(4, "rig", ((0.0, 0.0, 0.1),)))
+    assert "NeedlePlan" not in packed(component)
     path = m.Path(5_250_000_000, "rig", ((0.01, 0.0, 0.08), (0.01, 0.0, 0.1)))
-    hear(component, "needle/planned_path", path)
-    plan = np.array(says(component)["NeedlePlan"][0])
+    receive(component, "needle/planned_path", path)
+    plan = np.array(packed(component)["NeedlePlan"][0])
     np.testing.assert_allclose(plan, [[10.0, 0.0, 80.0], [10.0, 0.0, 100.0]])
     # A lost tip is not shown.
     for unseen in (
         pose(2_000_000_000, np.inf),
         m.PoseWithCovariance(2, "rig", TIP, (0.0,) * 4, (0.0,) * 36),
     ):
-        hear(component, "needle/tip_pose", unseen)
-        said = says(component)
-        assert said["NeedleStatus"][0] == "no tip found"
-        assert not said.keys() & {"NeedleTipToRig", "NeedleShaft"}
+        receive(component, "needle/tip_pose", unseen)
+        messages = packed(component)
+        assert messages["NeedleStatus"][0] == "no tip found"
+        assert not messages.keys() & {"NeedleTipToRig", "NeedleShaft"}
 
 
 def test_the_port_reports_clients_and_without_any_nothing_is_packed() -> None:
     component = OpenIGTLink(OpenIGTLinkParameters(port=0))
     (timer,), (row,) = component.timers, component.ports
     assert list(timer.handler(AT)) == [Send(LINK, (b"",))]
-    told = Diagnose("listeners", Diagnostic(Level.OK, "0 clients"))
-    assert list(row.handler((Listeners(0),), AT)) == [told]
+    reported = Diagnose("listeners", Diagnostic(Level.OK, "0 clients"))
+    assert list(row.handler((Listeners(0),), AT)) == [reported]
     (warned,) = row.handler((Listeners(1, ("header version 9, 1 bytes",)),), AT)
     assert isinstance(warned, Diagnose)
     assert warned.diagnostic.level is Level.WARN

@@ -300,7 +300,7 @@ def test_clients_receive_watched_topics_and_latched_ones_alone(left_view: Projec
     scene.runner.start(clients)
     scene.look_at(live_view.PATH)
 
-    def tell() -> set[str]:
+    def received() -> set[str]:
         clients.received.clear()
         scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
         scene.say("needle/controller_status", ControllerStatus(target_offset_m=0.003))
@@ -311,18 +311,18 @@ def test_clients_receive_watched_topics_and_latched_ones_alone(left_view: Projec
         return {topic for topic, _, _ in clients.received}
 
     latched = {"needle/controller_status", live_view.TF_STATIC, live_view.ROBOT_DESCRIPTION}
-    assert tell() == latched
+    assert received() == latched
     watched = {LEFT, "joint_states", "needle/reduced_state", live_view.TF}
     clients.todo.append(Send(FOXGLOVE, (Watched(frozenset(watched)),)))
     scene.runner.run(0.1)
-    assert tell() == latched | watched
+    assert received() == latched | watched
     (state,) = (one for topic, one, _ in clients.received if topic == "needle/reduced_state")
     assert state == m.Vector(1, "target_plane", TIP)
     on_topics = {topic for topic, _ in scene.published}
     assert on_topics == {live_view.ROBOT_DESCRIPTION, live_view.PATH}
     clients.todo.append(Send(FOXGLOVE, (Watched(frozenset()),)))
     scene.runner.run(0.1)
-    assert tell() == latched
+    assert received() == latched
     # Images are also received if only clients of the port request them.
     (port,) = scene.view.ports
     for topics in ({LEFT}, set()):

@@ -24,9 +24,9 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPE = "std_msgs/msg/UInt8MultiArray"
 LATCHED = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
 TOPICS = [
-    BagTopic(name, TYPE, told.definition, told.type_hash, (LATCHED,))
+    BagTopic(name, TYPE, standard.definition, standard.type_hash, (LATCHED,))
     for name in ("/one", "/two", "/three")
-    for told in [standard_topic(name, TYPE)]
+    for standard in [standard_topic(name, TYPE)]
 ]
 START, STEP = 1_700_000_000 * 10**9, 10_000_000
 RUN = {"commit": "0123abc", "run_info": "seed: 3"}
@@ -101,8 +101,8 @@ def numbers(path: Path) -> list[int]:
         assert reader.message_count == len(found)
     files = [path]
     if path.is_dir():
-        told = yaml.safe_load((path / "metadata.yaml").read_text())
-        files = [path / n for n in told["rosbag2_bagfile_information"]["relative_file_paths"]]
+        metadata = yaml.safe_load((path / "metadata.yaml").read_text())
+        files = [path / n for n in metadata["rosbag2_bagfile_information"]["relative_file_paths"]]
     indexed: list[bytes] = []
     streamed: list[bytes] = []
     for file in files:

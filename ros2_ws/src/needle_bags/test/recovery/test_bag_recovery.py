@@ -39,16 +39,16 @@ def test_a_killed_recording_is_recovered(tmp_path: Path) -> None:
     assert numbers(path) == list(range(recovery.messages))
     assert recovery.messages > 200
     assert "(the file ends inside a record) on: half a second at most if" in recovery.lost
-    told = read_contents(path)
-    custom = told.custom_data
+    recovered = read_contents(path)
+    custom = recovered.custom_data
     assert (custom["commit"], custom["run_info"]) == ("0123abc", "seed: 3")
     assert yaml.safe_load(custom["parameters"])["/two"]["ros__parameters"]["gain"] == 2.5
     (change,) = yaml.safe_load(custom["parameter_changes"])
     assert (change["stamp_ns"], change["value"]) == (5, 2.0)
     assert custom["recovered"] == recovery.lost
-    assert told.distribution == "jazzy"
-    assert told.topics["/one"].type_hash == TOPICS[0].type_hash
-    assert told.topics["/one"].offered_qos[0].durability is QosDurability.TRANSIENT_LOCAL
+    assert recovered.distribution == "jazzy"
+    assert recovered.topics["/one"].type_hash == TOPICS[0].type_hash
+    assert recovered.topics["/one"].offered_qos[0].durability is QosDurability.TRANSIENT_LOCAL
     with (path / "bag_0.mcap").open("rb") as stream:
         assert [a.data for a in make_reader(stream).iter_attachments()] == [b"left: {}\n"]
     assert (path / "bag_0.mcap.damaged").read_bytes() == before["bag_0.mcap"]
@@ -88,15 +88,15 @@ def test_the_command_reports_the_loss_and_leaves_a_whole_bag(
     assert contents(path) == before
     first = damage(path / "bag_0.mcap")
     assert recover.main([str(path), "--json", str(tmp_path / "out.json")]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     kept = len(numbers(path))
     values = json.loads((tmp_path / "out.json").read_text())
     assert (values["messages"], values["lost_s"]) == (kept, pytest.approx((300 - kept) / 100))
     assert kept <= first < kept + 60
-    assert f"recovered {path}: {kept} messages of 3 topics" in said
-    assert "of bag_0.mcap (a record is damaged: CRCValidationError) on: " in said
-    assert f"on: {(300 - kept) / 100:.1f} s follow" in said
-    assert "delete them when done: metadata.yaml.damaged, bag_0.mcap.damaged" in said
+    assert f"recovered {path}: {kept} messages of 3 topics" in output
+    assert "of bag_0.mcap (a record is damaged: CRCValidationError) on: " in output
+    assert f"on: {(300 - kept) / 100:.1f} s follow" in output
+    assert "delete them when done: metadata.yaml.damaged, bag_0.mcap.damaged" in output
 
 
 def test_a_bag_that_is_being_recorded_is_left_alone(tmp_path: Path) -> None:
@@ -114,9 +114,9 @@ def test_messages_compressed_one_by_one_are_recovered(tmp_path: Path) -> None:
     path = tmp_path / "bag"
     writer = OtherWriter(path, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
-    told: Any = {"msgdef": STRING.definition, "rihs01": STRING.type_hash}
+    definition: Any = {"msgdef": STRING.definition, "rihs01": STRING.type_hash}
     with writer:
-        topic = writer.add_connection("/a", STRING.type_name, **told)
+        topic = writer.add_connection("/a", STRING.type_name, **definition)
         for number in range(30):
             writer.write(topic, 1000 + number, string_message(f"message {number}"))
     (path / "metadata.yaml").unlink()
@@ -141,9 +141,9 @@ def test_an_unrecoverable_bag_gives_a_one_line_error_and_is_kept(
         path = tmp_path / name
         before = contents(path) if path.exists() else {}
         assert recover.main([str(path)]) == 2
-        said = capsys.readouterr().err
-        assert words in said
-        assert said.count("\n") == 1
+        error = capsys.readouterr().err
+        assert words in error
+        assert error.count("\n") == 1
         assert not before or contents(path) == before
 
 

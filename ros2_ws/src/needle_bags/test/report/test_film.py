@@ -67,9 +67,9 @@ def test_a_resting_needle_takes_no_frames(made_up: Run) -> None:
 
 
 def test_readings_belong_to_their_frame(made_up: Run) -> None:
-    told = dict(zip(READINGS, film_of(made_up)[-1].readings, strict=True))
-    assert list(told.values()) == [
-        *("120.0 mm", "-0.25 mm", "-0.15 mm", told["Pitch, estimated"], "+1 deg"),
+    readings = dict(zip(READINGS, film_of(made_up)[-1].readings, strict=True))
+    assert list(readings.values()) == [
+        *("120.0 mm", "-0.25 mm", "-0.15 mm", readings["Pitch, estimated"], "+1 deg"),
         f"{np.degrees(12.0):.0f} deg",
     ]
 

@@ -188,27 +188,27 @@ def test_verdicts(make_run: MakeRun) -> None:
     assert verdict_text(summarize(run))[0] == "Missed the plane"
     last = run.controller_status[-1]
 
-    def told(text: str) -> dict[str, JsonValue]:
+    def summary_at(text: str) -> dict[str, JsonValue]:
         status = dataclasses.replace(last, values={**last.values, "target_point_m": text})
         return summarize(dataclasses.replace(run, controller_status=[status]))
 
     # The verdict on a run to a point uses the point.
     x, y, z = run.truth.values[-1, :3]
-    near = told(f"{x!s}, {y + 0.0003!s}, {z - 0.0004!s}")
+    near = summary_at(f"{x!s}, {y + 0.0003!s}, {z - 0.0004!s}")
     assert near["point_error_mm"] == pytest.approx(0.5)
     assert near["converged"] is True
     assert "0.50 mm from the point" in verdict_text(near)[1]
-    far = told(f"{x!s}, {y + 0.002!s}, {z!s}")
+    far = summary_at(f"{x!s}, {y + 0.002!s}, {z!s}")
     assert far["converged"] is False
     assert verdict_text(far)[0] == "Missed the point"
     for nothing in ("", "1, 2", "a, b, c"):
-        assert told(nothing)["point_error_mm"] is None
+        assert summary_at(nothing)["point_error_mm"] is None
 
 
 def test_an_image_of_a_wrong_size_gives_a_one_line_error(
     make_run: MakeRun, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert report.main([str(make_run(image_height=7, steps=3))]) == 2
-    said = capsys.readouterr().err
-    assert "an image declares 7 rows of 4 pixels" in said
-    assert said.count("\n") == 1
+    error = capsys.readouterr().err
+    assert "an image declares 7 rows of 4 pixels" in error
+    assert error.count("\n") == 1

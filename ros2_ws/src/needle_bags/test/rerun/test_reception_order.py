@@ -16,12 +16,12 @@ def sent(time: int, topic: str) -> SentMessage:
     return SentMessage(time, time, f"/rig/{topic}", HEADER, serialized(header(0)))
 
 
-def heard_by(time: int, *heard: tuple[str, int]) -> SentMessage:
+def reception(time: int, *received: tuple[str, int]) -> SentMessage:
     """Return a controller status; `("joints", 7)`: it had received the joints sent at 7."""
-    told = ReceptionLog()
-    for topic, sent_ns in heard:
-        told.add(topic, sent_ns)
-    data = serialized(status({"heard": told.pop_text()}))
+    log = ReceptionLog()
+    for topic, sent_ns in received:
+        log.add(topic, sent_ns)
+    data = serialized(status({"heard": log.pop_text()}))
     return SentMessage(time, time, "/rig/needle/controller_status", STATUS, data)
 
 
@@ -30,36 +30,36 @@ SENT = partial(map, lambda pair: sent(*pair))
 
 
 @pytest.mark.parametrize(
-    ("messages", "heard"),
+    ("messages", "received"),
     [
         (  # The order is that of reception.
             [
                 *SENT([(10, J), (11, "result"), (12, "tip"), (20, J)]),
-                *(heard_by(30, ("tip", 12), (J, 10)), sent(40, J)),
-                heard_by(50, (J, 20), ("result", 11), (J, 40)),
+                *(reception(30, ("tip", 12), (J, 10)), sent(40, J)),
+                reception(50, (J, 20), ("result", 11), (J, 40)),
             ],
             [("tip", 12), (J, 10), (S, 30), (J, 20), ("result", 11), (J, 40), (S, 50)],
         ),
         (  # Messages that the last status lacks were received after it.
-            [*SENT([(10, J), (15, J), (16, X)]), heard_by(20, (J, 10)), sent(30, J)],
+            [*SENT([(10, J), (15, J), (16, X)]), reception(20, (J, 10)), sent(30, J)],
             [(J, 10), (X, 16), (S, 20), (J, 15), (J, 30)],
         ),
         # Without such statuses, the order is that of sending.
-        ([heard_by(20), sent(10, J)], [(J, 10), (S, 20)]),
+        ([reception(20), sent(10, J)], [(J, 10), (S, 20)]),
         (  # An unlisted message older than the last received one was never received.
             [
                 *SENT([(10, J), (11, X), (20, J)]),
-                *(heard_by(25, (J, 20)), *SENT([(30, J), (40, J)])),
-                *(heard_by(45, (J, 40)), sent(50, J)),
+                *(reception(25, (J, 20)), *SENT([(30, J), (40, J)])),
+                *(reception(45, (J, 40)), sent(50, J)),
             ],
             [(X, 11), (J, 20), (S, 25), (J, 40), (S, 45), (J, 50)],
         ),
     ],
 )
 def test_the_order_is_that_of_reception(
-    messages: list[SentMessage], heard: list[tuple[str, int]]
+    messages: list[SentMessage], received: list[tuple[str, int]]
 ) -> None:
     found = in_reception_order(list(messages), "/rig/")
     assert [time for time, _ in found] == sorted(time for time, _ in found)
     assert all(time >= message.time for time, message in found)
-    assert [(one.topic.rsplit("/", maxsplit=1)[-1], one.time) for _, one in found] == heard
+    assert [(one.topic.rsplit("/", maxsplit=1)[-1], one.time) for _, one in found] == received

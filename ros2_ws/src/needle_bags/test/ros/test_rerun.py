@@ -91,19 +91,19 @@ def paper_bag(tmp_path_factory: pytest.TempPathFactory, eight_steps: Path) -> Pa
 def test_unchanged_code_gives_unchanged_outputs(
     untouched: tuple[int, str], regression: Path
 ) -> None:
-    code, said = untouched
-    assert code == 0, f"{said}\nmeant? scripts/renew_regression_bag"
-    assert "6 image pairs through stereo_tracker, 121 tips through plane_controller" in said
-    assert "UNCHANGED" in said
+    code, output = untouched
+    assert code == 0, f"{output}\nmeant? scripts/renew_regression_bag"
+    assert "6 image pairs through stereo_tracker, 121 tips through plane_controller" in output
+    assert "UNCHANGED" in output
     # The table for reviewers of a diff must match the bag beside it.
     rows = (regression / TABLE).read_text().splitlines()[1:]
     assert len(rows) == read_contents(regression).counts["/needle/estimate"]
 
 
 def test_a_wrong_sign_in_the_projection_is_detected(mirrored: tuple[int, str]) -> None:
-    code, said = mirrored
+    code, output = mirrored
     assert code == 1
-    assert "needle/tip: 1 recorded only (at 30.0 mm" in said
+    assert "needle/tip: 1 recorded only (at 30.0 mm" in output
 
 
 @pytest.mark.parametrize(
@@ -124,9 +124,9 @@ def test_a_parameter_off_by_a_hundredth_is_detected(
 
 
 def test_another_preset_gives_a_separate_run(eight_steps: Path, paper_bag: Path) -> None:
-    code, said = printed(paper_bag)
+    code, output = printed(paper_bag)
     assert code == 0
-    assert "(paper)" in said
+    assert "(paper)" in output
     # Apart from the outputs, it is the same bag.
     before, after = read_contents(eight_steps), read_contents(paper_bag)
     assert before.counts == after.counts
@@ -159,19 +159,19 @@ def shown(first_pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("importlib.util.find_spec", lambda _: True)
         patch.setattr(openigtlink, "packed", lambda *_: b"needle")
-        code, said = printed(first_pictures, "--viewers", "--output", bag)
-    assert code == 0, said
-    return bag, said
+        code, output = printed(first_pictures, "--viewers", "--output", bag)
+    assert code == 0, output
+    return bag, output
 
 
 def test_viewers_show_the_recorded_needle_without_comparison(
     shown: tuple[Path, str], first_pictures: Path
 ) -> None:
-    bag, said = shown
+    bag, output = shown
     before, after = read_contents(first_pictures).counts, read_contents(bag).counts
     new = {topic.removeprefix("/"): n for topic, n in (after - before).items()}
     assert new.keys() == {live_view.TIP, live_view.PATH, live_view.MARKERS, *PICTURES}
-    (view,) = [line for line in said.splitlines() if line.startswith("live_view: ")]
+    (view,) = [line for line in output.splitlines() if line.startswith("live_view: ")]
     assert "nothing to compare, because its update times are not recorded; sent " in view
     for topic, count in new.items():
         assert f"{count} {topic}" in view
@@ -183,7 +183,7 @@ def test_viewers_show_the_recorded_needle_without_comparison(
     *_, (_, _, path) = read_messages(bag, f"/{live_view.PATH}".__eq__)
     tip = path.poses[-1].pose.position
     assert (tip.x, tip.y, tip.z) == tuple(run.tips.values[-1])
-    (link,) = [line for line in said.splitlines() if line.startswith("openigtlink: ")]
+    (link,) = [line for line in output.splitlines() if line.startswith("openigtlink: ")]
     assert "nothing to compare, because ports are not recorded; sent " in link
     assert int(link.split()[-2]) == pytest.approx(10 * seconds, abs=3)
 
@@ -195,17 +195,17 @@ def shown_again(shown: tuple[Path, str], tmp_path_factory: pytest.TempPathFactor
     bag, file = folder / "bag", folder / "result.json"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("importlib.util.find_spec", lambda _: None)
-        code, said = printed(shown[0], "--viewers", "--output", bag, "--json", file)
+        code, output = printed(shown[0], "--viewers", "--output", bag, "--json", file)
     assert code == 0
-    return bag, file, said
+    return bag, file, output
 
 
 def test_recorded_viewer_topics_are_replaced(shown: tuple[Path, str], shown_again: Shown) -> None:
-    bag, file, said = shown_again
+    bag, file, output = shown_again
     counts = read_contents(shown[0]).counts
     assert json.loads(file.read_text())["live_view_path_sent"] == counts["/live_view/path"]
     assert read_contents(bag).counts == counts
-    assert "openigtlink: left out, pyigtl is not installed" in said
+    assert "openigtlink: left out, pyigtl is not installed" in output
 
 
 def copied(bag: Path, target: Path, custom: dict[str, str], topic: BagTopic, first: bytes) -> None:
@@ -283,9 +283,9 @@ def test_bad_input_gives_a_one_line_error(
     }
     for arguments, words in table.items():
         assert rerun(*arguments) == 2
-        said = capsys.readouterr().err
-        assert words in said
-        assert said.count("\n") == 1
+        error = capsys.readouterr().err
+        assert words in error
+        assert error.count("\n") == 1
     for text, words in (
         ("curvatur: 8.0", "has no parameter curvatur"),
         ("curvature: -8.0", "curvature = -8"),

@@ -26,8 +26,8 @@ def test_summary_of_a_known_run(made_up: Run) -> None:
         "r1_rms_last_20_mm": float(np.sqrt(np.mean(r1**2))),
     }
     assert {key: summary[key] for key in expected} == pytest.approx(expected)
-    told = {"level": "tip", "controller": "paper", "seed": 7, "steps": 120, "wall_s": 12.5}
-    assert {key: summary[key] for key in told} == told
+    settings = {"level": "tip", "controller": "paper", "seed": 7, "steps": 120, "wall_s": 12.5}
+    assert {key: summary[key] for key in settings} == settings
     assert (summary["watchdog_trips"], summary["converged"]) == (3, True)
     # At level drive sim_rig has no status of its own to count unanswered ticks in.
     tick = HealthEvent(0, "sim_rig: watchdogs", 1, "the drives left a tick unanswered (1)")

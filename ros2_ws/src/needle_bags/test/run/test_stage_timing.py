@@ -27,9 +27,9 @@ def put(bag: BagCopy, topic: str, stamp: int, sent: int, received: int) -> None:
     bag.put(standard_topic(f"/rig/{topic}", HEADER), serialized(header(stamp)), received, sent)
 
 
-def put_status(bag: BagCopy, heard: int, sent: int, received: int) -> None:
+def put_status(bag: BagCopy, commanded: int, sent: int, received: int) -> None:
     """Write a status: the device has received commands up to this stamp."""
-    data = serialized(status({"command_ns": heard}))
+    data = serialized(status({"command_ns": commanded}))
     bag.put(standard_topic("/rig/device/status", STATUS), data, received, sent)
 
 

@@ -154,6 +154,6 @@ def test_invalid_parameters_are_rejected() -> None:
         ({"key": 0x300}, "key"),
         ({"source": "terminal"}, "source"),
     ]
-    for values, said in refused:
-        with pytest.raises(UserError, match=said):
+    for values, cause in refused:
+        with pytest.raises(UserError, match=cause):
             dataclasses.replace(PEDAL, **values)

@@ -82,10 +82,10 @@ def test_a_refusal_ends_the_hold_and_is_reported() -> None:
 
 
 def test_a_timeout_ends_the_hold() -> None:
-    for steps, said in enumerate(IN_VAIN):
+    for steps, cause in enumerate(IN_VAIN):
         retraction = at_step(steps)
         assert retraction.update(True, 1.0 + 0.99 * STEP_TIMEOUT, controller=True) is None
         assert not retraction.trouble
         retraction.update(True, 1.0 + 1.01 * STEP_TIMEOUT, controller=True)
         assert not holds(retraction)
-        assert said in retraction.trouble
+        assert cause in retraction.trouble

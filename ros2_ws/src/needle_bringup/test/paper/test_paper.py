@@ -104,7 +104,7 @@ def test_bad_arguments_give_a_one_line_error_and_exit_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("", "utf-8")
-    for words, said in (
+    for words, cause in (
         (["--seed", "-1"], "--seed"),
         (["--json", "/nowhere/f.json"], "/nowhere/f.json"),
         (["--out", str(tmp_path / "file")], "--out"),
@@ -112,7 +112,7 @@ def test_bad_arguments_give_a_one_line_error_and_exit_2(
         assert main(words) == 2
         captured = capsys.readouterr()
         assert len(captured.err.strip().splitlines()) == 1
-        assert said in captured.err
+        assert cause in captured.err
 
 
 @functools.cache

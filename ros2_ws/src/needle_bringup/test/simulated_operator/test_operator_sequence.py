@@ -31,8 +31,8 @@ def on_device(sequence: OperatorSequence, status: DeviceStatus, now: float = 1.0
     sequence.handle_device(dataclasses.replace(status, source="/sim_rig"), now)
 
 
-def on_controller(sequence: OperatorSequence, now: float = 2.0, **said: Any) -> None:
-    sequence.handle_controller(dataclasses.replace(STEERING, **said), now)
+def on_controller(sequence: OperatorSequence, now: float = 2.0, **changes: Any) -> None:
+    sequence.handle_controller(dataclasses.replace(STEERING, **changes), now)
 
 
 def without_status() -> OperatorSequence:

@@ -61,9 +61,9 @@ class Scene:
                         answer = Answer(service, not self.refusal, self.refusal)
                         self.take(self.operator.on_answer(answer, self.at))
 
-    def run(self, seconds: float = 1.0, **said: Any) -> None:
+    def run(self, seconds: float = 1.0, **changes: Any) -> None:
         """Publish a controller status, and advance time."""
-        self.controller = dataclasses.replace(self.controller, **said)
+        self.controller = dataclasses.replace(self.controller, **changes)
         rows = {row.topic: row.handler for row in self.operator.inputs}
         for _ in range(round(seconds / 0.05)):
             self.now += 0.05
@@ -130,7 +130,7 @@ def test_it_waits_until_the_recorder_has_all_parameters() -> None:
     scene = Scene(wait_for_recorder=True)
     (row,) = (row for row in scene.operator.inputs if row.topic == "/diagnostics")
     for recorded, asked in (("/stand_in", []), (f"/stand_in, /{RIG}", STARTED)):
-        told = m.Status("/recorder", "parameters_of", Level.OK, recorded)
-        scene.take(row.handler(m.Diagnostics(scene.at.stamp_ns, (told,)), scene.at))
+        status = m.Status("/recorder", "parameters_of", Level.OK, recorded)
+        scene.take(row.handler(m.Diagnostics(scene.at.stamp_ns, (status,)), scene.at))
         scene.run()
         assert scene.asked == asked

@@ -134,11 +134,11 @@ def test_user_components_are_found_in_the_current_folder(
     (tmp_path / f"{module}.py").write_text(PROBE)
     monkeypatch.chdir(tmp_path)
     assert own_component(f"{module}:Probe").name == "probe"
-    for name, said in (
+    for name, cause in (
         (f"{module}:Missing", "has no attribute 'Missing'"),
         (f"{module}:Needy", "missing 1 required positional argument: 'wanted'"),
         (f"{module}:Other", "makes a Other, not a Component"),
         ("no_such_module:X", "--component no_such_module:X: No module named"),
     ):
-        with pytest.raises(UserError, match=said):
+        with pytest.raises(UserError, match=cause):
             own_component(name)

@@ -43,7 +43,7 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
     bag, typo = str(tmp_path), str(tmp_path / "typo.yaml")
     emulator = file_of(tmp_path, "drive_emulator", channel="x")
     operator = file_of(tmp_path, "simulated_operator", stall_timeout=1.0)
-    for start, arguments, said in (
+    for start, arguments, cause in (
         (beside_rig, {"drives": typo}, "drives:=.*typo.yaml: no such file"),
         (beside_rig, {"params": typo}, "params:=.*typo.yaml: no such file"),
         (simulated, {"params": typo}, "params:=.*typo.yaml: no such file"),
@@ -61,7 +61,7 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
             "sim_rig: level is set by level:=",
         ),
     ):
-        with pytest.raises(UserError, match=said):
+        with pytest.raises(UserError, match=cause):
             start(**arguments)
 
 
@@ -115,8 +115,8 @@ def test_a_file_of_two_rigs_has_both_namespaces(tmp_path: Path) -> None:
 
 
 def test_an_existing_bag_is_played_for_viewers(tmp_path: Path) -> None:
-    for bag, said in (("", "bag:= is missing"), (str(tmp_path), "no bag there")):
-        with pytest.raises(UserError, match=said):
+    for bag, cause in (("", "bag:= is missing"), (str(tmp_path), "no bag there")):
+        with pytest.raises(UserError, match=cause):
             replayed_nodes({"bag": bag})
     (tmp_path / "metadata.yaml").touch()
     arguments = {"bag": str(tmp_path), "rate": "0.5", "start": "2.0", "loop": "true"}

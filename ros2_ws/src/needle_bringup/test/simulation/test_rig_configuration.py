@@ -128,12 +128,12 @@ def test_later_layers_replace_single_parameters_and_files_round_trip(tmp_path: P
 
 def test_a_file_must_not_conflict_with_the_command_line() -> None:
     path, options = Path("p.yaml"), parse(["--level", "tip"])
-    for given, said in (
+    for given, cause in (
         ({"plane_controller": {"depth": 0.1}}, "plane_controller: depth .* use --depth-mm"),
         ({"simulated_operator": {"wait_for_recorder": True}}, "simulate sets it itself"),
         ({"recorder": {"topics": ["/needle/tip"]}}, "recorder: topics cannot be in the file"),
     ):
-        with pytest.raises(UserError, match=said):
+        with pytest.raises(UserError, match=cause):
             refuse_reserved(path, given, options)
     refuse_reserved(path, {"plane_controller": {"curvature": 8.0}}, options)
 
@@ -180,14 +180,14 @@ def test_the_options_of_a_needle_set_all_nodes() -> None:
 
 
 def test_contradictions_are_reported() -> None:
-    for node, name, value, said in (
+    for node, name, value, cause in (
         ("sim_rig", "curvature", 6.0, "sim_rig has curvature 6 1/m, plane_controller has"),
         ("plane_controller", "curvature", 6.0, "--curvature sets it in all nodes"),
         ("stereo_tracker", "needle_width", 0.001, "needle_width 0.001 m"),
         ("sim_rig", "calibration_file", "mine.yaml", "stereo_tracker has calibration_file ''"),
     ):
         (line,) = contradictions(merge(nodes_for(), {node: {name: value}}), NODES)
-        assert said in line
+        assert cause in line
     curved: Parameters = {node: {"curvature": 12.0} for node in ("sim_rig", "plane_controller")}
     (line,) = contradictions(curved, NODES)
     assert line == "sim_rig has curvature 12, but stereo_tracker expects max_curvature 9"

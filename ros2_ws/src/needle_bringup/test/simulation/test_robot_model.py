@@ -35,8 +35,8 @@ def test_a_written_urdf_agrees_until_calibration_or_parameters_change(
     assert main(["--check", "--params", str(params), str(urdf)]) == 1
     assert capsys.readouterr().out == "insertion_joint limit upper is 0.2, expected 0.15\n"
     assert main(["--check", "--calibration", str(OTHER), str(urdf)]) == 1
-    said = capsys.readouterr().out.splitlines()
-    assert [line.partition(" is ")[0] for line in said] == [
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(" is ")[0] for line in lines] == [
         f"{side}_camera_joint origin {what}"
         for side in ("left", "right")
         for what in ("xyz", "rpy")
@@ -46,7 +46,7 @@ def test_a_written_urdf_agrees_until_calibration_or_parameters_change(
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "cause"),
     [
         ('"insertion_joint"', '"slide"', "insertion_joint joint type is missing"),
         ('"prismatic"', '"fixed"', "insertion_joint joint type is fixed, expected prismatic"),
@@ -58,11 +58,11 @@ def test_a_written_urdf_agrees_until_calibration_or_parameters_change(
     ],
 )
 def test_a_difference_is_named(
-    urdf: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+    urdf: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, cause: str
 ) -> None:
     urdf.write_text(urdf.read_text().replace(old, new))
     assert main(["--check", str(urdf)]) == 1
-    assert said in capsys.readouterr().out
+    assert cause in capsys.readouterr().out
 
 
 def test_shapes_rounding_effort_and_further_joints_do_not_matter(urdf: Path) -> None:
@@ -79,15 +79,15 @@ def test_parameters_that_contradict_each_other_are_named(
 ) -> None:
     params.write_text(params.read_text() + "\nlive_view: {ros__parameters: {max_depth: 0.2}}")
     assert main(["--check", "--params", str(params), str(urdf)]) == 1
-    said = "max_depth differs: device_driver has max_depth 0.15 m, live_view has max_depth 0.2 m"
-    assert said in capsys.readouterr().out
+    cause = "max_depth differs: device_driver has max_depth 0.15 m, live_view has max_depth 0.2 m"
+    assert cause in capsys.readouterr().out
 
 
 def test_invalid_input_ends_with_one_line(
     urdf: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     urdf.write_text("no")
-    for words, said in (
+    for words, cause in (
         (["--check", str(urdf)], "not a URDF: "),
         (["--check", str(tmp_path / "none")], "none: no such file"),
         (["--calibration", str(urdf), str(urdf)], "calibration"),
@@ -95,4 +95,4 @@ def test_invalid_input_ends_with_one_line(
     ):
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert said in line
+        assert cause in line

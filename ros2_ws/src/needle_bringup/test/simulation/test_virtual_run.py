@@ -135,9 +135,9 @@ def lossy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, str]:
     rig.sim_rig.close()
     assert rig.tap is not None
     rig.tap.close()
-    with contextlib.redirect_stdout(io.StringIO()) as said:
+    with contextlib.redirect_stdout(io.StringIO()) as output:
         assert rerun.main([str(bag)]) == 0
-    return rig, said.getvalue()
+    return rig, output.getvalue()
 
 
 def test_pairs_are_exposed_only_when_a_tip_is_expected(lossy: tuple[Rig, str]) -> None:

@@ -119,12 +119,12 @@ def test_targets_have_figures_of_points_and_none_of_the_plane(tmp_path: Path, la
 
 
 def test_bad_arguments_give_a_one_line_error_and_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, said in REFUSED:
+    for words, cause in REFUSED:
         assert main(words.split()) == 2, words
         captured = capsys.readouterr()
         assert captured.out == ""
         assert len(captured.err.strip().splitlines()) == 1
-        assert said in captured.err
+        assert cause in captured.err
 
 
 def test_disturbances_are_in_si_and_independent_of_the_claim() -> None:

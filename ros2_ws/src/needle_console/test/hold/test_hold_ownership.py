@@ -150,8 +150,8 @@ def test_barred_page_gets_the_reason(scene: Scene, is_local: bool) -> None:
     scene.bars[is_local] = "watching only"
     assert scene.say(page, True) is HoldRefusal.BARRED
     assert not scene.pressed
-    told = scene.message_to(page)
-    assert (told["bar"], told["why"]) == ("watching only", "watching only")
+    message = scene.message_to(page)
+    assert (message["bar"], message["why"]) == ("watching only", "watching only")
     scene.bars[is_local] = ""
     assert scene.say(page, True) is HoldRefusal.NEW_PRESS
     scene.press(page)

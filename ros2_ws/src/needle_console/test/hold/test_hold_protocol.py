@@ -25,9 +25,9 @@ def test_page_gets_the_reason_after_a_stall(first: str) -> None:
         scene.say(page, True)
     elif first == "look":
         scene.protocol.update(scene.now)
-    told = scene.message_to(page)
-    assert not told["held"]
-    assert told["why"].startswith("no echo from this page for 0.25 s")
+    message = scene.message_to(page)
+    assert not message["held"]
+    assert message["why"].startswith("no echo from this page for 0.25 s")
     assert scene.protocol.counts()["hold lost"] == 1
     scene.protocol.update(scene.now)
     assert not scene.reported[-1].pressed

@@ -66,14 +66,14 @@ def test_reason_of_an_ended_hold_is_kept_while_pressed() -> None:
     silent = DeviceStatus(state="HOLDING", reason="no hold message for 0.105 s, limit 0.1 s")
     again = DeviceStatus(reason="hold of 'console' ignored (hold_new_press)")
     stamps = DeviceStatus(reason="hold of 'console' ignored (hold_in_order)")
-    for told, why in (
+    for statuses, why in (
         ((moving, silent, again, again), silent.reason),
         # A stalled console did not receive more.
         ((moving, again), again.reason),
         ((moving, again, stamps), stamps.reason),
     ):
         picture = RigPicture()
-        for status in told:
+        for status in statuses:
             picture.set_device(status)
         device = picture.latest().device
         assert device is not None
@@ -135,8 +135,8 @@ def test_warnings_end_when_resolved_or_outdated() -> None:
 def test_readings_are_in_mm_and_degrees() -> None:
     assert set(readings(Snapshot(DeviceStatus(), ControllerStatus())).values()) == {NONE}
     picture = picture_of(0.05)
-    told = dataclasses.replace(STEERING, depth_m=0.12, r1_low_m=-0.0025, r1_high_m=-0.0015)
-    picture.set_controller(dataclasses.replace(told, reachable=True, reachable_depth_m=0.043))
+    steering = dataclasses.replace(STEERING, depth_m=0.12, r1_low_m=-0.0025, r1_high_m=-0.0015)
+    picture.set_controller(dataclasses.replace(steering, reachable=True, reachable_depth_m=0.043))
     shown = readings(picture.snapshot(0.0))
     assert shown["Depth"] == "50.0 mm of 120 mm"
     assert shown["Distance from plane"] == f"{MINUS}2.00 mm (95 %: {MINUS}2.50 to {MINUS}1.50)"
@@ -144,7 +144,7 @@ def test_readings_are_in_mm_and_degrees() -> None:
     assert shown["Reach"] == "the plane can be reached, from 43 mm on"
     picture.set_controller(
         dataclasses.replace(
-            told, reachable=False, target_point_m=(0.0, 0.0, 0.1), trusted="trusted"
+            steering, reachable=False, target_point_m=(0.0, 0.0, 0.1), trusted="trusted"
         )
     )
     shown = readings(picture.snapshot(0.0))

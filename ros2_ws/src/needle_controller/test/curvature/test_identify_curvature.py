@@ -116,7 +116,7 @@ def test_a_turned_base_is_rejected_except_for_the_part_before(
 
 def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "tips.csv"
-    for text, said in (
+    for text, cause in (
         ("x_m,y_m,z_m\n", "the file has no rows"),
         ("a,b\n1,2\n", "x_m is missing"),
         ("x_m,y_m,z_m\n0,0,0.01\n", "1 tips are too few"),
@@ -128,7 +128,7 @@ def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
         path.write_text(text)
         assert command(path) == 2
         error = capsys.readouterr().err
-        assert said in error
+        assert cause in error
         assert error.count("\n") == 1
 
 

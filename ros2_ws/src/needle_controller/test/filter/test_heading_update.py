@@ -104,7 +104,7 @@ def test_late_headings_are_replayed_and_the_frame_may_change() -> None:
     turns = turns_for(24, size=0.1)
     poses, at = path(turns, np.deg2rad(3.0)), np.eye(4)
     at[:3] = [[0.0, 1.0, 0.0, 0.01], [-1.0, 0.0, 0.0, -0.02], [0.0, 0.0, 1.0, 0.03]]
-    tips, known, told = noisy(poses, bound=2e-4), np.diag([1e-7, 2e-7, 3e-7]), []
+    tips, known, estimates = noisy(poses, bound=2e-4), np.diag([1e-7, 2e-7, 3e-7]), []
     for has_heading, frame in ((True, np.eye(4)), (True, at), (False, np.eye(4))):
         estimator = HypothesisFilter(FilterSettings(), None, np.zeros(3))
         estimator.reset(tips[0], np.zeros(2))
@@ -118,12 +118,12 @@ def test_late_headings_are_replayed_and_the_frame_may_change() -> None:
             if has_heading:
                 estimator.correct_heading(turn @ poses[exposed, :3, 2], 1e-4)
             estimator.correct(turn @ tips[exposed] + shift, turn @ known @ turn.T)
-        told.append((estimator.estimate(), frame[:3, :3] @ poses[20, :3, 2]))
-    here, there = told[0][0], told[1][0]
+        estimates.append((estimator.estimate(), frame[:3, :3] @ poses[20, :3, 2]))
+    here, there = estimates[0][0], estimates[1][0]
     assert LATE in here.warnings
     assert LATE in there.warnings
     wanted = at[:3, :3] @ here.position + at[:3, 3]
     np.testing.assert_allclose(there.position, wanted, atol=2e-4)
-    off = [float(np.linalg.norm(found.rotation[:, 2] - true)) for found, true in told]
+    off = [float(np.linalg.norm(found.rotation[:, 2] - true)) for found, true in estimates]
     assert max(off[:2]) < 0.01
     assert off[2] > 2.0 * max(off[:2])

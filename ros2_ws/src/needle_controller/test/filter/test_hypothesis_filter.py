@@ -157,10 +157,10 @@ def test_many_needles_equal_single_ones(with_covariance: bool) -> None:
     law = RollLaw(RollLawSettings())
     rates = together.roll_rates(RollLawSettings(), 0.0)
     for n, (alone, known) in enumerate(zip(every, together.each(), strict=True)):
-        said = alone.estimate()
+        expected = alone.estimate()
         for name in ("coordinates", "linearized", "covariance", "curvature"):
-            np.testing.assert_array_equal(getattr(known, name), getattr(said, name))
-        assert rates[n] == law(said).rotation_rate
+            np.testing.assert_array_equal(getattr(known, name), getattr(expected, name))
+        assert rates[n] == law(expected).rotation_rate
 
 
 @pytest.mark.parametrize(

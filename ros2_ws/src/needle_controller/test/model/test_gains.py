@@ -80,6 +80,6 @@ def test_weights_without_gains_are_rejected() -> None:
         ({"input_weight": 0.0}, "input_weight = 0"),
         ({"step_length": 0.05}, "unstable"),
     ]
-    for change, said in rows:
-        with pytest.raises(UserError, match=said):
+    for change, cause in rows:
+        with pytest.raises(UserError, match=cause):
             gains(**change)

@@ -67,8 +67,8 @@ def test_unreachable_planes_are_rejected() -> None:
         ("rig", [0.0] * 3, [0.0, 0.0, 0.0, 2.0], "length 2"),
         ("rig", [0.0] * 3, [0.0, half, 0.0, half], "90 deg"),
     ]
-    for frame, position, quaternion, said in rows:
-        with pytest.raises(UserError, match=said):
+    for frame, position, quaternion, cause in rows:
+        with pytest.raises(UserError, match=cause):
             plane_from_pose(frame, position, quaternion)
     for offset, depth in ((0.05, 0.12), (-0.05, 0.12), (3.0, 0.12), (0.05, 0.15)):
         with pytest.raises(UserError, match=r"cannot be reached.*reaches planes from .* to "):

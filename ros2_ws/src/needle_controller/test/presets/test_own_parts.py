@@ -156,7 +156,7 @@ def test_an_own_estimator_may_use_a_measured_heading(offer: Offer) -> None:
 
 
 def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
-    for sound, wrong, said in (
+    for sound, wrong, cause in (
         ("    def correct(self", "    def not_correct(self", "lacks correct(tip, covariance, age)"),
         ("def change_frame(", "def not_change_frame(", "lacks change_frame(T_new_old)"),
         ("class Own", "class Other", "has no attribute 'Own'"),
@@ -179,7 +179,7 @@ def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
         with pytest.raises(OwnPartError, match=rf"^estimator '{name}") as error:
             checked_estimator(name)
         text = str(error.value)
-        assert said in text
+        assert cause in text
         assert "docs/own_controllers.md" in text
         assert "\n" not in text
 
@@ -215,14 +215,14 @@ def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) ->
             ((0.0, 0.0, 0.1), 0.1),
             ((0.0, 0.0, -0.02), -0.02),
         ):
-            said = to_point(estimate, np.array(target)).insertion_left
-            assert said is not None
-            assert float(said) == pytest.approx(left)
+            remaining = to_point(estimate, np.array(target)).insertion_left
+            assert remaining is not None
+            assert float(remaining) == pytest.approx(left)
 
 
 def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
     rate = "40.0 * insertion"
-    for wrong, said in (
+    for wrong, cause in (
         ("np.nan", "contains nan"),
         ("np.zeros(3)", "has shape (3,), expected ()"),
         ("'fast'", "is of type str"),
@@ -230,7 +230,7 @@ def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
     ):
         with pytest.raises(OwnPartError) as error:
             checked_law(offer("law", LAW.replace(rate, wrong)))
-        assert said in str(error.value)
+        assert cause in str(error.value)
     # A law for planes alone is not tried with a point.
     name = offer("law", LAW.replace("def to_point", "def not_to_point"))
     with pytest.raises(UserError, match=r"cannot steer to a point: it lacks to_point"):

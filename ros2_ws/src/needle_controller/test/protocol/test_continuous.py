@@ -145,8 +145,8 @@ def test_without_hold_no_path_and_after_it_only_from_a_new_tip() -> None:
     rig.expose_tip()
     rig.steering.on_device(MOVING)
     rig.go(0.4 * MM)
-    said = rig.steering.on_result(rig.steering.command_ns, "aborted: hold released")
-    assert logged(said) == "path aborted: hold released"
+    actions = rig.steering.on_result(rig.steering.command_ns, "aborted: hold released")
+    assert logged(actions) == "path aborted: hold released"
     rig.steering.on_device(FREE)
     assert state_of(rig) == (SteeringState.STEERING, Awaiting.HOLD)
     assert not paths_in(rig.expose_tip())

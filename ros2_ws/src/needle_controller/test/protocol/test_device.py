@@ -60,8 +60,8 @@ def test_silence_of_the_device_and_its_end_are_logged() -> None:
         assert rig.steering.watchdog.silence
         assert state_of(rig) == (SteeringState.STEERING, Awaiting.RESULT)
         assert rig.steering.on_time(1e3) == []
-        heard = rig.settle(1) if by_joints else rig.steering.on_device(MOVING)
-        assert "sends messages again" in logged(heard)
+        actions = rig.settle(1) if by_joints else rig.steering.on_device(MOVING)
+        assert "sends messages again" in logged(actions)
         assert not rig.steering.watchdog.silence
         rig.steering.on_device(HOLD)
         rig.run(step)
@@ -110,9 +110,9 @@ def test_a_device_that_stops_ends_steering() -> None:
         (log,) = rig.steering.on_device(status)
         assert state_of(rig) == (state, NOTHING)
         assert getattr(log, "severity", "") == severity
-        said = logged([log])
-        assert f"{state.value}: device is {status.state}" in said
-        assert status.reason in said
+        text = logged([log])
+        assert f"{state.value}: device is {status.state}" in text
+        assert status.reason in text
         assert rig.steering.on_result(step.stamp_ns, "aborted: stopped") == []
         assert rig.expose() == []
         rig.steering.on_device(HOLD)
@@ -156,9 +156,9 @@ def test_unfollowed_steps_are_a_fault() -> None:
         for count in range(1, MAX_UNFOLLOWED_STEPS + 1):
             assert rig.steering.state is SteeringState.STEERING
             rig.run(rig.good_tips(), part=share)
-            said = logged(rig.settle())
-            assert "device/result reports success" in said
-            assert ("3 times in a row" in said) is (count == MAX_UNFOLLOWED_STEPS)
+            text = logged(rig.settle())
+            assert "device/result reports success" in text
+            assert ("3 times in a row" in text) is (count == MAX_UNFOLLOWED_STEPS)
         assert state_of(rig) == (FAULT, NOTHING)
         assert rig.steering.step == 3
         # A start resets the count.

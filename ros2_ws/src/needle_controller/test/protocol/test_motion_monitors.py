@@ -61,11 +61,11 @@ def test_five_resting_samples_after_the_answer_are_a_standstill() -> None:
 def test_motion_is_detected_between_two_calls() -> None:
     watchdog = Watchdog()
     looks = [None, 0.01, 0.01 + 1.9e-6, 0.01 + 4e-6, 0.01 + 1.9e-6, None, 0.01]
-    said = [
+    detected = [
         watchdog.has_moved(None if place is None else JointSample(k, place, 0.0))
         for k, place in enumerate(looks)
     ]
-    assert said == [False, False, False, True, True, False, False]
+    assert detected == [False, False, False, True, True, False, False]
 
 
 def retractions(watch: RetractionMonitor, *places: float) -> list[bool]:

@@ -86,19 +86,19 @@ def test_the_miss_probability_of_a_point_is_its_frequency() -> None:
 
 
 def test_the_reception_log_round_trips_once_in_order() -> None:
-    heard = ReceptionLog()
-    assert received_messages(heard.pop_text()) == []
+    log = ReceptionLog()
+    assert received_messages(log.pop_text()) == []
     messages = [("joint_states", 1_700_000_000_000_000_000), ("needle/tip", 5), ("joint_states", 7)]
     for message in messages:
-        heard.add(*message)
-    assert received_messages(heard.pop_text()) == messages
-    assert heard.pop_text() == ""
+        log.add(*message)
+    assert received_messages(log.pop_text()) == messages
+    assert log.pop_text() == ""
     # The log is full until it is published.
     for number in range(103):
-        assert heard.is_full is (number >= 100)
-        heard.add("joint_states", number)
-    assert len(received_messages(heard.pop_text())) == 103
-    assert not heard.is_full
+        assert log.is_full is (number >= 100)
+        log.add("joint_states", number)
+    assert len(received_messages(log.pop_text())) == 103
+    assert not log.is_full
     # Malformed entries are ignored.
     found = received_messages("joint_states soon, needle/tip -1, device/result 7, x 8 9")
     assert found == [("device/result", 7)]

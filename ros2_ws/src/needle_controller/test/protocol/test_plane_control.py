@@ -268,9 +268,9 @@ def test_the_reason_without_path_names_an_entry_with_a_path() -> None:
         [Obstacle((-0.06, y, 0.025), (0.06, y, 0.025), 0.011) for y in (-0.045, -0.025, -0.005)]
     )
     control.target_point = np.array([0.0, 0.008, 0.1])
-    said = control.path_problem(0.0)
-    assert "m instead of (0, 0)" in said
-    x, y = (float(part) for part in said.split("entry at (")[1].split(") m")[0].split(","))
+    problem = control.path_problem(0.0)
+    assert "m instead of (0, 0)" in problem
+    x, y = (float(part) for part in problem.split("entry at (")[1].split(") m")[0].split(","))
     assert y > 0.0
     shift = np.array([x, y, 0.0])
     control.target_point = control.target_point - shift

@@ -28,7 +28,7 @@ def covariance_at(rig: Rig, ahead: int = 0) -> TipCovariance:
 
 def test_a_rejected_tip_causes_no_motion_and_another_is_awaited() -> None:
     kinds = set()
-    for position, frame, fault, said in (
+    for position, frame, fault, cause in (
         ([np.nan, 0.0, 0.0], "rig", TipFault.NOT_FINITE, "not finite"),
         ([0.0, 0.0, 0.0], "map", TipFault.FRAME, "'map'"),
         ([0.5, 0.2, 1.0], "rig", TipFault.TOO_FAR, "from the entry point"),
@@ -37,10 +37,10 @@ def test_a_rejected_tip_causes_no_motion_and_another_is_awaited() -> None:
         tip = bad(rig, position, frame)
         (log,) = rig.expose(tip)
         assert isinstance(log, Log)
-        assert said in log.text
+        assert cause in log.text
         kinds.add(log.kind)
         assert rig.steering.tips.rejected == {fault: 1}
-        assert said in rig.steering.rejection
+        assert cause in rig.steering.rejection
         assert rig.steering.reason == f"tip refused: {rig.steering.rejection}"
         assert not rig.steering.control.started
         assert state_of(rig) == (STEERING, Awaiting.TIP)
@@ -90,8 +90,8 @@ def test_a_tip_timeout_ends_with_a_good_tip() -> None:
     assert rig.steering.on_time(100.0) == []
     assert rig.steering.on_time(100.0 + 0.99 * timeout) == []
     assert state_of(rig) == (STEERING, Awaiting.TIP)
-    said = logged(rig.steering.on_time(100.0 + timeout))
-    assert said == "WAITING_FOR_TIP: no good tip for 2 s"
+    text = logged(rig.steering.on_time(100.0 + timeout))
+    assert text == "WAITING_FOR_TIP: no good tip for 2 s"
     assert state_of(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_time(100.0 + 3 * timeout) == []
@@ -114,8 +114,8 @@ def test_a_step_without_joint_confirmation_is_reported_after_the_tip_timeout() -
     rig = Rig()
     rig.steering.on_result(sent(rig.expose()).stamp_ns, "succeeded")
     rig.steering.on_time(0.0)
-    said = logged(rig.steering.on_time(2.0))
-    assert said == "WAITING_FOR_TIP: joint_states do not show the end of step 1"
+    text = logged(rig.steering.on_time(2.0))
+    assert text == "WAITING_FOR_TIP: joint_states do not show the end of step 1"
 
 
 def test_time_does_not_run_while_a_person_pauses() -> None:

@@ -25,7 +25,7 @@ def test_start_reports_the_missing_device_state() -> None:
     bare.on_device(HOLD)
     assert bare.on_start()[0].message == "no joint_states received"
     rig = Rig(started=False)
-    for status, said in (
+    for status, cause in (
         (MOVING, "waiting for the device to stop"),
         (device("MOVING", False), "waiting for the device to stop"),
         (device("HOLDING", False), "not homed"),
@@ -33,7 +33,7 @@ def test_start_reports_the_missing_device_state() -> None:
         (device("ESTOPPED"), "not enabled (ESTOPPED)"),
     ):
         rig.steering.on_device(status)
-        assert said in rig.start()
+        assert cause in rig.start()
         assert state_of(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
 
 
@@ -68,11 +68,11 @@ def test_start_waits_until_joints_and_device_agree() -> None:
 def test_start_is_refused_for_an_inserted_or_rolled_needle() -> None:
     assert Rig(started=False, insertion=0.002).start() == "steering"
     assert "is 0.0021 m in, on an unknown path" in Rig(started=False, insertion=0.0021).start()
-    for short, said in ((0.9e-6, "has reached the depth 0.001 m"), (1.1e-6, "steering")):
-        assert said in Rig(started=False, depth=0.001, insertion=0.001 - short).start()
+    for short, cause in ((0.9e-6, "has reached the depth 0.001 m"), (1.1e-6, "steering")):
+        assert cause in Rig(started=False, depth=0.001, insertion=0.001 - short).start()
     for degrees, started in ((79.0, True), (-79.0, True), (81.0, False), (-81.0, False)):
-        said = Rig(started=False, preset="paper", rotation=math.radians(degrees)).start()
-        assert ("roll in target_plane" not in said) is started, degrees
+        reply = Rig(started=False, preset="paper", rotation=math.radians(degrees)).start()
+        assert ("roll in target_plane" not in reply) is started, degrees
     # Preset best has no limit.
     assert Rig(started=False, rotation=-8.0).start() == "steering"
 
@@ -86,9 +86,9 @@ def test_start_and_stop_are_idempotent() -> None:
     assert rig.start() == "already steering"
     assert rig.steering.starts == 1
     rig.steps(5)
-    for said in ("stopped", "was not steering (IDLE)"):
+    for text in ("stopped", "was not steering (IDLE)"):
         reply, _ = rig.steering.on_stop()
-        assert (reply.success, reply.message) == (True, said)
+        assert (reply.success, reply.message) == (True, text)
         assert state_of(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
     # Steering continues with the old estimate.
     assert rig.start() == "steering"
@@ -136,5 +136,5 @@ def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.Monk
         rig.run(sent(actions))
     assert "IDLE: no path from insertion 0.0" in logged(actions)
     assert state_of(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-    said = steering.control.path_problem(0.0)
-    assert "no path to the target point is clear of the 3 obstacles, nor from any entry" in said
+    problem = steering.control.path_problem(0.0)
+    assert "no path to the target point is clear of the 3 obstacles, nor from any entry" in problem

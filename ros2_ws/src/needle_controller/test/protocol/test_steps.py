@@ -78,8 +78,8 @@ def test_an_aborted_step_resumes_from_where_the_joints_are() -> None:
     rig = Rig()
     step = sent(rig.expose())
     rig.steering.on_device(FREE)
-    said = rig.run(step, part=0.3, text="aborted: hold released")
-    assert logged(said) == "step 1 aborted: hold released"
+    actions = rig.run(step, part=0.3, text="aborted: hold released")
+    assert logged(actions) == "step 1 aborted: hold released"
     assert state_of(rig) == (STEERING, Awaiting.HOLD)
     assert rig.steering.step == 0
     assert rig.steering.reason == "step aborted: hold released"

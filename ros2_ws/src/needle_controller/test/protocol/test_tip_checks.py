@@ -86,7 +86,7 @@ def test_unreachable_positions_are_rejected() -> None:
 
 
 def test_invalid_covariances_are_rejected() -> None:
-    for matrix, said in (
+    for matrix, cause in (
         (np.eye(3) * 1e-12, ""),
         (np.eye(3) + 0.9e-9 * np.eye(3, k=1), ""),
         (np.eye(3) + 1.1e-9 * np.eye(3, k=1), "not symmetric"),
@@ -96,9 +96,9 @@ def test_invalid_covariances_are_rejected() -> None:
         (np.diag([1.0, -1.0, 1.0]), "not positive definite"),
     ):
         problem = TipCovariance(0, "rig", matrix).problem()
-        assert (said in problem) if said else not problem, matrix
+        assert (cause in problem) if cause else not problem, matrix
     assert "frame 'map'" in TipCovariance(0, "map", np.eye(3)).problem()
-    for z, variance, said in (
+    for z, variance, cause in (
         (1.0, 1e-4, ""),
         (0.9, 1e-4, "length 0.9"),
         (NAN, 1e-4, "length nan"),
@@ -106,4 +106,4 @@ def test_invalid_covariances_are_rejected() -> None:
         (1.0, NAN, "variance nan"),
     ):
         problem = TipCovariance(0, "rig", np.eye(3), (np.array([0.0, 0.0, z]), variance)).problem()
-        assert (said in problem) if said else not problem, (z, variance)
+        assert (cause in problem) if cause else not problem, (z, variance)

@@ -59,9 +59,9 @@ def test_an_internal_error_is_one_line_and_in_development_a_traceback_before_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run_command(lambda: raise_(ValueError("two\nlines"))) == 3
-    said = capsys.readouterr().err
-    assert said.startswith("error: internal error, please report it: ValueError: two lines (test_c")
-    assert said.count("\n") == 1
+    text = capsys.readouterr().err
+    assert text.startswith("error: internal error, please report it: ValueError: two lines (test_c")
+    assert text.count("\n") == 1
     develops = types.SimpleNamespace(flags=types.SimpleNamespace(dev_mode=True), stderr=sys.stderr)
     monkeypatch.setattr(cli, "sys", develops)
     assert internal_error(ValueError("odd")) == 3

@@ -91,9 +91,9 @@ def reason(path: Path) -> str:
 def refusal(bag: Path) -> str:
     """Return the reason of a rejection; reader and `recover` give the same, and change nothing."""
     before = {file: file.read_bytes() for file in bag.iterdir()}
-    said = reason(bag)
+    text = reason(bag)
     with pytest.raises(UserError) as caught:
         recover_bag(bag)
-    assert str(caught.value) == said
+    assert str(caught.value) == text
     assert {file: file.read_bytes() for file in bag.iterdir()} == before
-    return said
+    return text

@@ -105,9 +105,9 @@ def test_an_unsupported_storage_is_not_reported_as_broken(
     change(bag, version=10, something_new={"a": 1})
     assert read(bag) == ALL
     change(bag, **{"version": 9, **values})
-    said = refusal(bag)
-    assert words in said
-    assert "recover" not in said
+    text = refusal(bag)
+    assert words in text
+    assert "recover" not in text
 
 
 def test_a_truncated_sqlite_bag_is_refused_with_another_remedy(tmp_path: Path) -> None:

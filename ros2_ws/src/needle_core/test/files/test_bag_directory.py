@@ -96,14 +96,14 @@ def test_an_index_with_other_messages_is_rejected(tmp_path: Path, chunked: bool)
 
 
 def test_metadata_with_other_messages_are_rejected(bag: Path) -> None:
-    told = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
-    a, b = told["topics_with_message_count"]
+    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    a, b = metadata["topics_with_message_count"]
     for wrong in (
         {"message_count": COUNT + 1},
         {"topics_with_message_count": [a]},
         {"topics_with_message_count": [a, {**b, "message_count": 1 + COUNT // 2}]},
-        {"relative_file_paths": [*told["relative_file_paths"], "bag_1.mcap"]},
+        {"relative_file_paths": [*metadata["relative_file_paths"], "bag_1.mcap"]},
         {"version": "9"},
     ):
-        change(bag, **{**told, **wrong})
+        change(bag, **{**metadata, **wrong})
         assert "recover" in reason(bag)

@@ -84,7 +84,7 @@ def test_a_failure_is_bad_input_an_internal_error_or_ignored_after_a_signal(
 ) -> None:
     bad, odd = UserError("rate = 0 Hz, must be > 0"), RuntimeError("a fault of its own")
     lost = rclpy_implementation.RCLError("bad name")
-    for create, spin, code, said in (
+    for create, spin, code, error in (
         (fail(bad), None, 2, "error: rate = 0 Hz, must be > 0\n"),
         (fail(bad, signalled=True), None, 0, "error: rate = 0 Hz, must be > 0\n"),
         (fail(lost), None, 2, "error: bad name\n"),
@@ -95,7 +95,7 @@ def test_a_failure_is_bad_input_an_internal_error_or_ignored_after_a_signal(
     ):
         middleware.done.clear()
         assert run(create, spin=spin) == code
-        assert capsys.readouterr().err.startswith(said)
+        assert capsys.readouterr().err.startswith(error)
         assert middleware.done[-1] == "shutdown"
         assert ("destroyed" in middleware.done) is (spin is not None)
 
@@ -106,14 +106,14 @@ def test_arguments_are_explained_or_rejected_before_the_start(
     for word in ("--help", "-h"):
         assert run(None, word) == 0
         assert capsys.readouterr().out.startswith("HELP\n")
-    for words, said in (
+    for words, cause in (
         (("--fast",), "'--fast'; see --help"),
         (("-p", "x:=1"), "'-p'; put it after --ros-args"),
         (("rate:=1", "--ros-args", "-p", "other:=1"), "set a parameter with --ros-args -p rate:=1"),
         (("--ros-args", "--params-file", "none.yaml"), "none.yaml: cannot be read"),
     ):
         assert run(None, *words) == 2
-        assert said in capsys.readouterr().err
+        assert cause in capsys.readouterr().err
     assert middleware.done == []
 
 

@@ -124,11 +124,11 @@ def run(
     components: Sequence[Component], seconds: float = 3.0, **options: Any
 ) -> tuple[VirtualRunner, list[tuple[int, str, Any]]]:
     """Run; return all publications: stamp, topic, message."""
-    told: list[tuple[int, str, Any]] = []
+    published: list[tuple[int, str, Any]] = []
 
     def tap(stamp: int, sender: str, message: Any, output: Output) -> None:
-        told.append((stamp, output.topic, message))
+        published.append((stamp, output.topic, message))
 
     runner = VirtualRunner(components, taps=(tap,), **options)
     runner.run(seconds)
-    return runner, told
+    return runner, published

@@ -28,7 +28,7 @@ class Clerk(c.Component):
         return ()
 
     def _on_text(self, message: m.Text, at: c.Moment) -> c.Actions:
-        yield c.Log("info", "heard")
+        yield c.Log("info", "received")
         yield c.Publish("out", message)
         yield c.Publish("aside", message)
         yield c.Send("door", (message.text,))
@@ -42,40 +42,40 @@ class Clerk(c.Component):
         yield c.Publish("out", m.Text("knock"))
 
 
-def heard(clerk: Clerk, *times: float) -> tuple[BagRunner, list[str]]:
+def replay(clerk: Clerk, *times: float) -> tuple[BagRunner, list[str]]:
     runner = BagRunner(clerk, ["out"])
-    said = [
+    texts = [
         action.message.text
         for time in times
         for action in runner.deliver("in", m.Text(f"at {time}"), c.Moment(time, 0))
     ]
-    return runner, said
+    return runner, texts
 
 
 def test_timers_tick_before_the_message_at_which_they_are_due() -> None:
     clerk = Clerk()
-    _, said = heard(clerk, 10.0, 10.4, 10.6, 10.9, 11.0)
+    _, texts = replay(clerk, 10.0, 10.4, 10.6, 10.9, 11.0)
     assert clerk.ticks == [10.6, 11.0]
-    assert said == ["at 10.0", "at 10.4", "tick 1", "at 10.6", "at 10.9", "tick 2", "at 11.0"]
+    assert texts == ["at 10.0", "at 10.4", "tick 1", "at 10.6", "at 10.9", "tick 2", "at 11.0"]
 
 
 def test_a_gap_of_a_century_is_one_tick_and_the_phase_stays() -> None:
     clerk = Clerk()
-    heard(clerk, 0.0, 3e9 + 0.1, 3e9 + 0.4, 3e9 + 0.6)
+    replay(clerk, 0.0, 3e9 + 0.1, 3e9 + 0.4, 3e9 + 0.6)
     assert clerk.ticks == [3e9 + 0.1, 3e9 + 0.6]
 
 
 def test_messages_without_subscriber_are_dropped_and_the_others_counted() -> None:
     clerk = Clerk()
-    runner, said = heard(clerk, 1.0, 1.1)
-    assert said == ["at 1.0", "at 1.1"]
+    runner, texts = replay(clerk, 1.0, 1.1)
+    assert texts == ["at 1.0", "at 1.1"]
     assert runner.counts == {"out": 2, "door": 2}
     assert set(clerk.peers.subscribers) == {"out"}
 
 
 def test_port_input_is_handled_and_every_timer_has_a_last_tick() -> None:
     clerk = Clerk()
-    runner, _ = heard(clerk, 1.0)
+    runner, _ = replay(clerk, 1.0)
     (answer,) = runner.arrive("door", ("a", "b"), c.Moment(1.0, 0))
     assert (answer.message.text, clerk.batches) == ("knock", [("a", "b")])
     assert [action.message.text for action in runner.finish(c.Moment(math.inf, 0))] == ["tick 1"]

@@ -24,13 +24,13 @@ class Worker(Component):
         self.wall = wall
         self.takes: list[float] = []
         self.ticks: list[tuple[float, float]] = []
-        self.heard: list[tuple[Any, float]] = []
+        self.received: list[tuple[Any, float]] = []
         self.changes: list[PortChange] = []
-        self.ports = (Port("outside", self._hear, self._on_change),)
+        self.ports = (Port("outside", self._receive, self._on_change),)
         self.timers = (Timer(PERIOD, self._tick),)
 
-    def _hear(self, batch: Sequence[Any], at: Moment) -> Actions:
-        self.heard += [(item, at.steady) for item in batch]
+    def _receive(self, batch: Sequence[Any], at: Moment) -> Actions:
+        self.received += [(item, at.steady) for item in batch]
         yield Send("outside", tuple(f"{item} heard" for item in batch))
 
     def _on_change(self, change: PortChange, at: Moment) -> Actions:
@@ -93,9 +93,9 @@ def test_input_is_handled_at_the_time_of_the_wall_clock() -> None:
     for when in (0.503, 0.507):
         scene.wall.at(scene.wall.now + when, partial(scene.line.arrive, (when,)))
     scene.runner.run(1.0)
-    assert len(scene.worker.heard) == 2
-    for said, heard in scene.worker.heard:
-        assert heard == pytest.approx(said, abs=1e-3)
+    assert len(scene.worker.received) == 2
+    for sent, received in scene.worker.received:
+        assert received == pytest.approx(sent, abs=1e-3)
     assert scene.line.sent == ["0.503 heard", "0.507 heard"]
 
 
@@ -130,7 +130,7 @@ def test_input_during_a_delay_is_read_and_handled_right_after_it() -> None:
     for batch in (("stop",), lambda: (scene.wall.now,), tuple):
         scene.wall.at(begin + 1.0, partial(scene.line.arrive, batch))
     scene.runner.run(2.0)
-    (what, when), (asked_at, _) = scene.worker.heard
+    (what, when), (asked_at, _) = scene.worker.received
     assert what == "stop"
     assert when < 2.0 * PERIOD
     assert asked_at == pytest.approx(begin + 3.0, abs=SLACK)

@@ -38,8 +38,8 @@ NUMBER = 0
 """Number of a request, by which the server of the scene identifies it."""
 
 
-def texts(told: Sequence[tuple[int, str, Any]]) -> list[str]:
-    return [message.text for _, topic, message in told if topic == "/rosout"]
+def texts(published: Sequence[tuple[int, str, Any]]) -> list[str]:
+    return [message.text for _, topic, message in published if topic == "/rosout"]
 
 
 # ---- messages -----------------------------------------------------------------------------------
@@ -166,30 +166,30 @@ def test_a_handler_that_raises_is_reported_and_ends_nothing() -> None:
                 raise ZeroDivisionError("by zero")
 
     receiver = Receiver()
-    _, told = run([Broken(), receiver])
-    assert texts(told) == ["internal error: ZeroDivisionError: by zero"]
-    health = [message for _, topic, message in told if topic == "/diagnostics"]
+    _, published = run([Broken(), receiver])
+    assert texts(published) == ["internal error: ZeroDivisionError: by zero"]
+    health = [message for _, topic, message in published if topic == "/diagnostics"]
     assert health[0].statuses[0].level is Level.ERROR
     assert {4, 5, 6} <= set(receiver.numbers)
-    _, told = run([Once([Publish("others", EmergencyStop(True))])])
-    assert texts(told) == ["internal error: ValueError: others is not among its outputs"]
+    _, published = run([Once([Publish("others", EmergencyStop(True))])])
+    assert texts(published) == ["internal error: ValueError: others is not among its outputs"]
 
 
 def test_diagnostics_are_published_on_change_and_once_a_second() -> None:
     well = Diagnose("part", Diagnostic(Level.OK, "well", {"count": "1"}))
     counted = Diagnose("part", Diagnostic(Level.OK, "well", {"count": "2"}))
     ill = Diagnose("part", Diagnostic(Level.WARN, "ill"))
-    _, told = run([Once([well, counted, ill])])
-    health = [m.statuses[0].text for _, topic, m in told if topic == "/diagnostics"]
+    _, published = run([Once([well, counted, ill])])
+    health = [m.statuses[0].text for _, topic, m in published if topic == "/diagnostics"]
     assert health == ["well", *["ill"] * 4]
 
 
 def test_a_component_that_exits_does_nothing_more_and_ends_the_run() -> None:
     once = Once([Exit(1, "done"), Log("info", "never said")])
-    runner, told = run([once, Sender()])
+    runner, published = run([once, Sender()])
     assert runner.exits == {"once": Exit(1, "done")}
     assert 0.5 <= runner.now < 0.7
-    assert texts(told) == []
+    assert texts(published) == []
     runner.stop("sender")
     assert runner.run(1.0)
     assert runner.exits["sender"] == Exit(0)
@@ -224,13 +224,13 @@ def test_waiting_input_of_a_port_is_one_batch() -> None:
         return other._take(batch, at)
 
     other.ports = (Port("wire", take),)
-    runner, told = run([one, other], seconds=0.0)
+    runner, published = run([one, other], seconds=0.0)
     runner.run(0.1)
     assert max(batches) <= 6
     runner.freeze("other", 0.1)
     runner.run(0.2)
     assert max(batches) > 100
-    assert told == []
+    assert published == []
     numbers = [number for _, number in other.arrived]
     assert numbers == list(range(1, len(numbers) + 1))
 
@@ -337,8 +337,8 @@ def test_settings_and_the_clock_of_stamps_may_change() -> None:
         def on_settings(self, settings: Any, at: Moment) -> Actions:
             yield Log("info", f"{settings} at {at.steady:.1f}, {at.stamp_ns // 10**8}")
 
-    runner, told = run([Settled()], seconds=1.0)
+    runner, published = run([Settled()], seconds=1.0)
     runner.timeline.clock_offset_ns = -500_000_000
     runner.configure("sender", 7)
     runner.run(0.01)
-    assert texts(told) == ["7 at 1.0, 15"]
+    assert texts(published) == ["7 at 1.0, 15"]

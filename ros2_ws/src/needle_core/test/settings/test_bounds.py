@@ -36,14 +36,14 @@ def test_a_value_within_its_bounds_passes() -> None:
 
 
 def test_a_value_out_of_bounds_is_reported_with_its_bounds() -> None:
-    for settings, said in (
+    for settings, cause in (
         (Settings(width=0.0), r"width = 0 m is outside"),
         (Settings(gate=-1.0), r"gate = -1 is outside"),
         (Settings(noise=5.1), r"noise = 5.1 m is outside \[0, 5\] m"),
         (Settings(noise=2147483648.0), r"noise = 2147483648 m is outside"),
         (Settings(noise=1e30), r"noise = 1e\+30 m is outside"),
     ):
-        with pytest.raises(OutOfBoundsError, match=said):
+        with pytest.raises(OutOfBoundsError, match=cause):
             check_bounded_fields(settings)
 
 
@@ -72,7 +72,7 @@ class Parameters:
 def test_parameters_are_applied_with_their_types_or_rejected_with_the_node() -> None:
     values = {"rate": 100.0, "count": 1, "gains": [0.0, 9.0], "law": "pid"}
     assert from_values(Parameters, values, "/rig") == Parameters(100.0, 1, (0.0, 9.0), "pid")
-    for wrong, said in (
+    for wrong, cause in (
         ({"rate": 100.1}, "rate = 100.1 Hz is outside [1, 100] Hz"),
         ({"rate": 50}, "rate = 50 is not of type float (write 50.0)"),
         ({"count": True}, "count = True is of type bool, expected int"),
@@ -83,7 +83,7 @@ def test_parameters_are_applied_with_their_types_or_rejected_with_the_node() -> 
     ):
         with pytest.raises(UserError) as caught:
             from_values(Parameters, wrong, "/rig")
-        assert str(caught.value) == f"/rig: {said}"
+        assert str(caught.value) == f"/rig: {cause}"
     rate, _, _, _, gains, _, law, _ = describe(Parameters).splitlines()
     assert rate == "  rate: 30.0 Hz [1, 100]"
     assert gains == "  gains: [1.0] [0, 9] (fixed at start)"

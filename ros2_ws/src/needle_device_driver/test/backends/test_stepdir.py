@@ -65,8 +65,8 @@ def test_the_set_up_switches_off_and_tells_ramp_switch_and_dead_man() -> None:
     assert board.run(board.protocol.identify()) == "stepdir 1"
     board.run(board.protocol.set_up("insertion"))
     board.run(board.protocol.set_up("rotation"))
-    told = [line[1:-4] for line in board.lines if not any(beat in line for beat in BEATS)]
-    assert [body.partition(b",")[2] for body in told[1:]] == [
+    sent = [line[1:-4] for line in board.lines if not any(beat in line for beat in BEATS)]
+    assert [body.partition(b",")[2] for body in sent[1:]] == [
         *(b"I", b"P,0,0", b"R", b"C,0,800000,-1,150"),
         *(b"P,1,0", b"R", b"C,1,100000,1,150"),
     ]

@@ -46,7 +46,7 @@ class Line:
         self.protocol = ZaberProtocol(settings, {a: settings.axis(a) for a in AXES}, self.link)
         self.statuses: list[tuple[int, dict[str, DriveReply]]] = []
         self.protocol.on_status = lambda number, at: self.statuses.append((number, dict(at)))
-        self.heard: list[str] = []
+        self.received: list[str] = []
 
     def sent(self) -> bytes:
         return b"".join(self.link.pop_outgoing())
@@ -67,7 +67,7 @@ class Line:
             for device, axis, number, command in re.findall(
                 r"/(\d+) (\d) (\d+) ([^:]*):..\n", self.sent().decode()
             ):
-                self.heard.append(f"{device} {axis} {command}")
+                self.received.append(f"{device} {axis} {command}")
                 if data is None:
                     continue
                 answer = data.get(command, "0")
@@ -83,7 +83,7 @@ class Line:
         self.talk(self.protocol.identify(), data)
         for axis in AXES:
             self.talk(self.protocol.set_up(axis), data)
-        self.heard.clear()
+        self.received.clear()
         return self
 
     def answer(self, number: int, *, flag: str = "--", status: str = "IDLE") -> None:
@@ -102,8 +102,8 @@ def test_identify_ends_a_partial_line_and_switches_checksums_on() -> None:
     assert line.talk(line.protocol.identify(), NEW) == (
         "Emulated Zaber, device 1: ID 50952, firmware 7.38, device 2: ID 50952, firmware 7.38"
     )
-    assert "1 0 set comm.checksum 1" in line.heard
-    assert "2 0 set comm.checksum 1" in line.heard
+    assert "1 0 set comm.checksum 1" in line.received
+    assert "2 0 set comm.checksum 1" in line.received
     real = {**NEW, "get system.serial": "49822"}
     assert line.talk(line.protocol.identify(), real).startswith("Zaber, device 1")
 
@@ -119,7 +119,7 @@ def test_set_up_of_a_device_after_power_up() -> None:
     line = Line()
     line.talk(line.protocol.set_up("insertion"), NEW)
     # 0.5 m/s^2 and 5 mm/s at 1e6 counts/m: values 500000 * 1.6384e-4 and 5000 * 1.6384.
-    assert [text.removeprefix("1 1 ") for text in line.heard] == [
+    assert [text.removeprefix("1 1 ") for text in line.received] == [
         "driver disable",
         "set accel 82",
         "set maxspeed 8192",
@@ -139,7 +139,7 @@ def test_set_up_of_a_device_after_power_up() -> None:
 def test_set_up_keeps_a_position_that_has_a_reference() -> None:
     line = Line()
     line.talk(line.protocol.set_up("insertion"), {**NEW, "warnings": "01 WH"})
-    assert "1 1 set pos 0" not in line.heard
+    assert "1 1 set pos 0" not in line.received
 
 
 def test_orders_are_point_moves_with_their_own_speed() -> None:
@@ -154,9 +154,9 @@ def test_orders_are_point_moves_with_their_own_speed() -> None:
         b"/2 1 0 stop:47\n/1 1 0 driver disable:8E\n"
     )
     line.talk(line.protocol.write_limits("rotation", -100, 200), {})
-    assert line.heard == ["2 1 set limit.min -100", "2 1 set limit.max 200"]
+    assert line.received == ["2 1 set limit.min -100", "2 1 set limit.max 200"]
     line.talk(line.protocol.release("rotation"), {})
-    assert line.heard[-1] == "2 1 driver disable"
+    assert line.received[-1] == "2 1 driver disable"
 
 
 def test_the_last_set_points_make_up_for_the_ramps() -> None:
@@ -194,7 +194,7 @@ def test_each_request_asks_for_positions_and_one_slow_state() -> None:
 def test_a_rotation_homed_where_it_stands_has_no_switches(method: int, asks: bool) -> None:
     line = Line(rotation_homing_method=method)
     line.talk(line.protocol.set_up("rotation"), NEW)
-    assert ("2 1 get limit.home.state" in line.heard) is asks
+    assert ("2 1 get limit.home.state" in line.received) is asks
 
 
 def test_positions_are_measured_by_the_encoder_in_counts_of_the_moves() -> None:
@@ -248,7 +248,7 @@ def test_a_restart_shows_behind_a_higher_flag() -> None:
     assert states["insertion"].rebooted
     assert not states["rotation"].rebooted
     line.talk(line.protocol.clear_fault("insertion"), {})
-    assert line.heard[-1] == "1 1 warnings clear"
+    assert line.received[-1] == "1 1 warnings clear"
 
 
 def test_switches_follow_their_requests() -> None:

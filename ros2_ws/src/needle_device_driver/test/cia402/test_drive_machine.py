@@ -14,13 +14,13 @@ DISABLED, READY, ON, ENABLED, QUICK_STOP, FAULT = 0x0250, 0x0231, 0x0233, 0x0237
 NUMBERS = itertools.count(1)
 
 
-def said(statusword: int, position: int = 0, mode: int = 8, behind: int = 0) -> Feedback:
+def state(statusword: int, position: int = 0, mode: int = 8, behind: int = 0) -> Feedback:
     return Feedback(next(NUMBERS), statusword, mode, 0, position, behind)
 
 
 @pytest.fixture
 def machine() -> DriveMachine:
-    return DriveMachine(rest_counts=2, period=0.02, stop_time=0.05, at=said(DISABLED))
+    return DriveMachine(rest_counts=2, period=0.02, stop_time=0.05, at=state(DISABLED))
 
 
 def orders(machine: DriveMachine, *answers: Feedback) -> list[DriveCommand]:
@@ -36,7 +36,7 @@ def orders(machine: DriveMachine, *answers: Feedback) -> list[DriveCommand]:
 def enabled(machine: DriveMachine, position: int = 0) -> None:
     machine.set_goal(Goal.ON)
     assert machine.switching
-    orders(machine, *(said(word, position) for word in (DISABLED, READY, ON, ENABLED)))
+    orders(machine, *(state(word, position) for word in (DISABLED, READY, ON, ENABLED)))
     assert machine.ready
     assert not machine.switching
 
@@ -50,10 +50,10 @@ def test_no_command_after_a_quick_stop_before_the_axis_rests(
     machine.set_goal(goal)
     # Jitter of two counts in the last three cycles.
     ways = [*itertools.accumulate((400, 300, 200, 100, 3, 2, 2))]
-    given = orders(machine, *(said(QUICK_STOP, position) for position in ways))
+    given = orders(machine, *(state(QUICK_STOP, position) for position in ways))
     assert given == [DriveCommand.QUICK_STOP] * 7
     wanted = {Goal.OFF: DriveCommand.DISABLE_VOLTAGE, Goal.ON: DriveCommand.ENABLE_OPERATION}
-    assert orders(machine, said(QUICK_STOP, 1009)) == [wanted[goal]]
+    assert orders(machine, state(QUICK_STOP, 1009)) == [wanted[goal]]
     assert machine.target == 1009
 
 
@@ -61,7 +61,7 @@ def test_stop_is_repeated_until_the_drive_confirms_it(machine: DriveMachine) -> 
     enabled(machine)
     machine.stop()
     machine.set_goal(Goal.ON)
-    assert orders(machine, *[said(ENABLED)] * 5) == [DriveCommand.QUICK_STOP] * 5
+    assert orders(machine, *[state(ENABLED)] * 5) == [DriveCommand.QUICK_STOP] * 5
     assert not machine.ready
 
 
@@ -70,12 +70,12 @@ def test_blocked_axis_is_released_when_stopped(machine: DriveMachine, behind: in
     enabled(machine)
     machine.stop()
     places = (400, 500, 500, 500, 500)
-    given = orders(machine, *(said(QUICK_STOP, place, behind=behind // 3 * 2) for place in places))
+    given = orders(machine, *(state(QUICK_STOP, place, behind=behind // 3 * 2) for place in places))
     assert (given, machine.released_after_block) == ([DriveCommand.QUICK_STOP] * 5, False)
-    assert orders(machine, said(QUICK_STOP, 500, behind=behind)) == [DriveCommand.DISABLE_VOLTAGE]
+    assert orders(machine, state(QUICK_STOP, 500, behind=behind)) == [DriveCommand.DISABLE_VOLTAGE]
     assert machine.released_after_block
     assert machine.powered, "it is stopped, it has not lost its power"
-    assert orders(machine, said(DISABLED, 500)) == [DriveCommand.DISABLE_VOLTAGE]
+    assert orders(machine, state(DISABLED, 500)) == [DriveCommand.DISABLE_VOLTAGE]
     assert machine.problem == ""
     enabled(machine, 500)
     assert not machine.released_after_block
@@ -99,13 +99,13 @@ def test_drive_that_moves_on_in_its_quick_stop_is_switched_off(
     for _ in range(2):
         enabled(machine)
         machine.stop()
-        given = orders(machine, *(said(QUICK_STOP, at) for at in itertools.accumulate(ways)))
+        given = orders(machine, *(state(QUICK_STOP, at) for at in itertools.accumulate(ways)))
         # 3 cycles for a ramp of 50 ms, 2 for late answers, 5 to observe the motion.
         assert given[:9] == [DriveCommand.QUICK_STOP] * 9
         late = DriveCommand.DISABLE_VOLTAGE if off else DriveCommand.QUICK_STOP
         assert given[9:] == [late] * 11
         assert ("keeps moving in its quick stop" in machine.problem) is off
-        machine.restart(said(DISABLED))
+        machine.restart(state(DISABLED))
 
 
 def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> None:
@@ -115,16 +115,16 @@ def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> 
     # The axis rests since it was enabled.
     assert machine.next_order() == (DriveCommand.QUICK_STOP, position)
     for answer, order in (
-        (said(QUICK_STOP), (DriveCommand.DISABLE_VOLTAGE, position)),
-        (said(DISABLED), (DriveCommand.SHUTDOWN, Mode.HOMING)),
+        (state(QUICK_STOP), (DriveCommand.DISABLE_VOLTAGE, position)),
+        (state(DISABLED), (DriveCommand.SHUTDOWN, Mode.HOMING)),
         # Not enabled before the drive shows the mode.
-        (said(ON), (DriveCommand.SWITCH_ON, Mode.HOMING)),
-        (said(ON, mode=6), (DriveCommand.ENABLE_OPERATION, Mode.HOMING)),
+        (state(ON), (DriveCommand.SWITCH_ON, Mode.HOMING)),
+        (state(ON, mode=6), (DriveCommand.ENABLE_OPERATION, Mode.HOMING)),
     ):
         machine.update(answer)
         assert machine.next_order() == order
         assert not machine.powered
-    machine.update(said(ENABLED, mode=6))
+    machine.update(state(ENABLED, mode=6))
     assert (machine.powered, machine.ready) == (True, False)
 
 
@@ -134,14 +134,14 @@ def test_axis_that_never_rests_is_switched_off(
     enabled(machine)
     machine.set_goal(Goal.OFF)
     # Jitter, which is no motion.
-    given = orders(machine, *(said(QUICK_STOP, 8 + 8 * (count % 2)) for count in range(51)))
+    given = orders(machine, *(state(QUICK_STOP, 8 + 8 * (count % 2)) for count in range(51)))
     assert given == [DriveCommand.QUICK_STOP] * 50 + [DriveCommand.DISABLE_VOLTAGE]
 
 
 def test_drive_that_ignores_the_stop_is_switched_off(machine: DriveMachine) -> None:
     enabled(machine)
     machine.stop()
-    given = orders(machine, *(said(ENABLED, 100 * count) for count in range(35)))
+    given = orders(machine, *(state(ENABLED, 100 * count) for count in range(35)))
     assert given == [DriveCommand.QUICK_STOP] * 34 + [DriveCommand.DISABLE_VOLTAGE]
     assert "keeps moving when stopped" in machine.problem
 
@@ -150,11 +150,11 @@ def test_fault_is_not_acknowledged_and_unknown_statusword_is_a_problem(
     machine: DriveMachine,
 ) -> None:
     enabled(machine)
-    assert orders(machine, said(FAULT)) == [DriveCommand.DISABLE_VOLTAGE]
+    assert orders(machine, state(FAULT)) == [DriveCommand.DISABLE_VOLTAGE]
     assert machine.problem == ""
-    machine.update(said(0x0025))
+    machine.update(state(0x0025))
     assert machine.problem == "reports 0x0025, not a CiA 402 statusword"
-    machine.restart(said(DISABLED, 7))
+    machine.restart(state(DISABLED, 7))
     assert (machine.problem, machine.target, machine.switching) == ("", 7, False)
 
 
@@ -170,7 +170,7 @@ def test_drive_that_is_not_on_after_two_seconds_is_reported(
     machine: DriveMachine, statusword: int, mode: int, text: str
 ) -> None:
     machine.set_goal(Goal.ON)
-    orders(machine, *[said(statusword, mode=mode)] * 100)
+    orders(machine, *[state(statusword, mode=mode)] * 100)
     assert machine.problem == ""
-    machine.update(said(statusword, mode=mode))
+    machine.update(state(statusword, mode=mode))
     assert machine.problem == f"is not on after 2 s: {text}"

@@ -259,14 +259,14 @@ class Daemon:
     """A socketcand server that sends all its replies in advance."""
 
     def __init__(
-        self, monkeypatch: pytest.MonkeyPatch, said: bytes = b"< hi >< ok >< ok >"
+        self, monkeypatch: pytest.MonkeyPatch, answer: bytes = b"< hi >< ok >< ok >"
     ) -> None:
         with socket.create_server(("localhost", 0)) as server:
             server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             self.client = CONNECT(server.getsockname())
             self.peer, _ = server.accept()
         self.client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
-        self.peer.sendall(said)
+        self.peer.sendall(answer)
         self.peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         monkeypatch.setattr(socket, "create_connection", lambda *_: self.client)
         monkeypatch.setattr(can_port, "_RECEIVE_TIMEOUT", 0.0)
@@ -319,13 +319,13 @@ def test_socketcand_receives_frames_in_any_pieces(
 def test_socketcand_refuses_another_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for said, why in (
+    for answer, why in (
         (b"", "got nothing"),
         (b"SSH-2.0-OpenSSH_9.2\r\n", "got nothing"),
         (b"< hello >", "got '< hello >'"),
         (b"< hi >< error could not open bus >", "got '< error could not open bus >'"),
     ):
-        daemon = Daemon(monkeypatch, said)
+        daemon = Daemon(monkeypatch, answer)
         assert why in Port("socketcand").changes[0]
         assert daemon.client.fileno() == -1, "closed"
         daemon.close()

@@ -162,12 +162,12 @@ def test_frames_match_canopen(size: int) -> None:
 def test_link_counts_errors_passes_frames_and_reports_refusals() -> None:
     link = FrameLink("virtual test")
     link.open()
-    heard: list[tuple[bytes, float]] = []
-    link.subscribe(0x181, lambda data, time: heard.append((data, time)))
+    received: list[tuple[bytes, float]] = []
+    link.subscribe(0x181, lambda data, time: received.append((data, time)))
     link.now = 2.0
     frames = [CanFrame(0x181, b"\x01", time=1.5), CanFrame(0x181, b"\x02"), CanFrame(0x182)]
     link.receive([*frames, CanFrame(0x181, remote=True), CanErrors(2), CanErrors(0, 1)])
-    assert heard == [(b"\x01", 1.5), (b"\x02", 2.0)]
+    assert received == [(b"\x01", 1.5), (b"\x02", 2.0)]
     assert (link.bus_errors, link.frames_received) == (3, 3)
     with pytest.raises(DriveError, match=r"does not answer.*the adapter rejects"):
         at_once(ObjectAccess(link, 1).read(DEVICE_TYPE))

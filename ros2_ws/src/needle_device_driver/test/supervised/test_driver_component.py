@@ -159,12 +159,12 @@ def test_drive_that_refuses_its_limits_is_never_enabled() -> None:
 def test_status_rate_is_limited_for_positions() -> None:
     rig = ConformanceRig(1)
     rig.moving(duration=4.0)
-    told = []
+    changed = []
     for _ in range(50):
         before = rig.hand.status
         rig.runner.run(PERIOD)
-        told.append(rig.hand.status is not before)
-    assert 1 <= told.count(True) <= 2
+        changed.append(rig.hand.status is not before)
+    assert 1 <= changed.count(True) <= 2
 
 
 def test_joint_states_carry_the_time_of_the_sync() -> None:

@@ -67,13 +67,13 @@ class Witness(Bench):
     """Checks every cycle with an independent model of the hold."""
 
     def __init__(self) -> None:
-        self.heard: dict[str, tuple[float, bool]] = {}
+        self.received: dict[str, tuple[float, bool]] = {}
         super().__init__(**_LIMITS)
 
     def hold(self, pressed: bool = True, *, sender: str = "a", **more: Any) -> str:
         good = 0.0 <= more.get("scale", 1.0) <= 1.0
         if not pressed or not good or more.get("count") is None:
-            self.heard[sender] = (self.now, pressed and good)
+            self.received[sender] = (self.now, pressed and good)
         return super().hold(pressed, sender=sender, **more)
 
     def exchange(self) -> None:
@@ -94,7 +94,7 @@ class Witness(Bench):
         assert abs(moved) <= fastest * 0.02 * (1 + 1e-6)
         if moved != 0.0:
             assert self.state == "MOVING"
-            held = [pressed and self.now - at <= 0.25 for at, pressed in self.heard.values()]
+            held = [pressed and self.now - at <= 0.25 for at, pressed in self.received.values()]
             assert self.activity == "homing" or any(held), "moved without a hold"
         return moved
 

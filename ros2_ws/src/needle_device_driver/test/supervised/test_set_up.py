@@ -37,7 +37,7 @@ def has(**attributes: object) -> Change:
     return lambda drive: drive.__dict__.update(attributes)
 
 
-def tells(values: Values) -> Change:
+def reports(values: Values) -> Change:
     """Set values of a drive."""
     return lambda drive: drive.set_objects(values)
 
@@ -66,23 +66,23 @@ def kept(index: int, wanted: int, made: int) -> tuple[Change, str]:
     return makes(index, wanted, made), f"was set to {wanted} at 0x{index:04X}"
 
 
-def in_unit(index: int, code: int, told: str) -> tuple[Change, str]:
+def in_unit(index: int, code: int, unit: str) -> tuple[Change, str]:
     what = {0x60A8: "positions", 0x60A9: "speeds", 0x60AA: "ramps"}[index]
-    text = f"the drive measures {what} in {told} (0x{index:04X} = 0x{code:08X}), expected counts"
-    return tells({**TURN, (index, 0): code}), text
+    text = f"the drive measures {what} in {unit} (0x{index:04X} = 0x{code:08X}), expected counts"
+    return reports({**TURN, (index, 0): code}), text
 
 
 def fed(*ratio: int) -> Change:
     """Give a drive in rpm a gear of 5 : 2 and a feed in counts."""
     gear = {(0x6091, 1): 5, (0x6091, 2): 2, (0x6092, 1): ratio[0], (0x6092, 2): ratio[1]}
-    return tells(IN_RPM | gear)
+    return reports(IN_RPM | gear)
 
 
 REFUSED: list[tuple[Change, str]] = [
-    (tells({(0x1000, 0): 401}), "node 1 has device profile 401, expected 402"),
-    (tells({(0x6502, 0): 0x205}), "node 1 has no homing mode (0x6502 = 0x00000205)"),
+    (reports({(0x1000, 0): 401}), "node 1 has device profile 401, expected 402"),
+    (reports({(0x6502, 0): 0x205}), "node 1 has no homing mode (0x6502 = 0x00000205)"),
     (
-        all_of(tells({(0x6502, 0): 0x225}), has(modes={6})),
+        all_of(reports({(0x6502, 0): 0x225}), has(modes={6})),
         "node 1 has no cyclic synchronous position mode (0x6060 = 8, 0x6061 = 0)",
     ),
     (
@@ -91,15 +91,15 @@ REFUSED: list[tuple[Change, str]] = [
     ),
     (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x06")), "write 8 to 0x6060:0 mode"),
     (makes(0x1016, 127 << 16 | 100, 0), "0x1016:1 consumer heartbeat time but reads back 0"),
-    (all_of(tells({(0x1017, 0): 0}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
-    (all_of(tells({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
+    (all_of(reports({(0x1017, 0): 0}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
+    (all_of(reports({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     (refuses(RANGE, 0x605A), "node 1 refuses to write 6 to 0x605A:0"),
     (refuses(RANGE, 0x605E), "node 1 refuses to write 2 to 0x605E:0"),
     # A method to a switch is never replaced by one where the axis stands.
     (refuses(RANGE, 0x6098, but=b"\x25"), "refuses to write 17 to 0x6098:0"),
     # It happens to have the values for a drive without home.
     (
-        all_of(tells({(0x607D, 1): 2**31, (0x607D, 2): 2**31 - 1}), refuses(READ_ONLY, 0x607D)),
+        all_of(reports({(0x607D, 1): 2**31, (0x607D, 2): 2**31 - 1}), refuses(READ_ONLY, 0x607D)),
         "refuses to write -2147483648 to 0x607D:1",
     ),
     *(kept(0x607D, wanted, 0) for wanted in (-(2**31), 2**31 - 1)),
@@ -114,12 +114,12 @@ REFUSED: list[tuple[Change, str]] = [
     in_unit(0x60A8, 0xFFB5_0000, "10^-1 counts"),
     # Counts per turn unknown or ambiguous; an invalid factor.
     (
-        tells({(0x60A9, 0): RPM, (0x608F, 1): 20_000}),
+        reports({(0x60A9, 0): RPM, (0x608F, 1): 20_000}),
         "speeds in rpm (0x60A9 = 0x00B44700), expected counts/s; *_counts_per_turn converts",
     ),
     (fed(360, 1), "reports 50000 (0x608F, 0x6091) and 360 (0x6092) counts per turn"),
     (
-        all_of(lacks(0x60A9, 0x60AA), tells({(0x6096, 1): 60, (0x6096, 2): 20_000})),
+        all_of(lacks(0x60A9, 0x60AA), reports({(0x6096, 1): 60, (0x6096, 2): 20_000})),
         "the drive scales speeds by 0.003 (0x6096), expected counts/s",
     ),
     # It answers no SYNC.
@@ -172,7 +172,7 @@ def units(speed: int, ramp: int, more: Values, per_speed: float, per_ramp: float
     """Return a drive with units, and its expected speeds and ramps."""
     wanted = {at: max(1, round(counts / per_speed)) for at, counts in SPEEDS.items()}
     wanted |= {at: round(counts / per_ramp) for at, counts in RAMPS.items()}
-    return tells({(0x60A9, 0): speed, (0x60AA, 0): ramp, **more}), wanted, ""
+    return reports({(0x60A9, 0): speed, (0x60AA, 0): ramp, **more}), wanted, ""
 
 
 ASSUMED = "does not report its units; assumed: "
@@ -191,11 +191,11 @@ TAKEN: list[Row] = [
     units(RPM, COUNTS_2, TURN, 20_000 / 60, 1.0),
     units(COUNTS, RPM_S, {**TURN, (0x6096, 1): 60, (0x6096, 2): 1}, 1.0, 20_000 / 60),
     (fed(100_000, 2), {(0x6085, 0): 12_000}, ""),
-    (all_of(tells(TURN), lacks(0x60A8, 0x60A9, 0x60AA)), SPEEDS | RAMPS, UNTOLD),
-    (tells({(0x60A9, 0): 0, (0x60AA, 0): 0}), SPEEDS | RAMPS, UNTOLD),
-    (all_of(tells(IN_RPM), lacks(0x60AA)), {(0x6085, 0): 30_000}, f"{ASSUMED}the unit of its sp"),
+    (all_of(reports(TURN), lacks(0x60A8, 0x60A9, 0x60AA)), SPEEDS | RAMPS, UNTOLD),
+    (reports({(0x60A9, 0): 0, (0x60AA, 0): 0}), SPEEDS | RAMPS, UNTOLD),
+    (all_of(reports(IN_RPM), lacks(0x60AA)), {(0x6085, 0): 30_000}, f"{ASSUMED}the unit of its sp"),
     (
-        all_of(lacks(0x60A9), tells({(0x6096, 1): 7, (0x6096, 2): 7})),
+        all_of(lacks(0x60A9), reports({(0x6096, 1): 7, (0x6096, 2): 7})),
         SPEEDS | RAMPS,
         f"{ASSUMED}counts/s (0x60A9);",
     ),
@@ -203,9 +203,9 @@ TAKEN: list[Row] = [
     (refuses(RANGE, 0x605B, 0x1029, 0x1006), {}, "keeps its own 0x605B"),
     (lacks(0x1006, 0x1029, 0x6007), {}, "has no 0x6007"),
     (makes(0x6083, 10**6, 65_535), {(0x6083, 0): 65_535}, ""),
-    (all_of(tells({(0x1017, 0): 200}), refuses(READ_ONLY, 0x1017)), {(0x1017, 0): 200}, ""),
-    (all_of(tells({(0x1017, 0): 1}), refuses(READ_ONLY, 0x1017)), {}, ""),
-    (all_of(tells({(0x605A, 0): 6}), refuses(READ_ONLY, 0x605A)), {(0x605A, 0): 6}, ""),
+    (all_of(reports({(0x1017, 0): 200}), refuses(READ_ONLY, 0x1017)), {(0x1017, 0): 200}, ""),
+    (all_of(reports({(0x1017, 0): 1}), refuses(READ_ONLY, 0x1017)), {}, ""),
+    (all_of(reports({(0x605A, 0): 6}), refuses(READ_ONLY, 0x605A)), {(0x605A, 0): 6}, ""),
     # Unlisted modes are tried after switching off.
     (all_of(lacks(0x6502), has(state="enabled")), {(0x6040, 0): 0}, ""),
     # Other sizes than in the standard; counters of less than 32 bits.
@@ -221,7 +221,7 @@ TAKEN: list[Row] = [
     (no_types(b"\xff"), {(0x1400, 2): 0xFE, (0x1401, 2): 1}, ""),
     (no_types(b"\x01"), {(0x1400, 2): 0xFF, (0x1401, 2): 0xFF}, ""),
     # Unused process data.
-    (tells({(0x1802, 1): 0x4000_0381}), {(0x1802, 1): 0xC000_0381, (0x1800, 3): 0}, ""),
+    (reports({(0x1802, 1): 0x4000_0381}), {(0x1802, 1): 0xC000_0381, (0x1800, 3): 0}, ""),
     (lacks(0x60FD), {(0x1A00, 0): 2}, "has no digital inputs to map"),
     (
         has(refuses=lambda i, s, v: NOT_MAPPABLE * ((i, v) == (0x1A00, b"\x20\x00\xfd\x60"))),
@@ -243,8 +243,8 @@ def test_drives_of_many_makers_are_set_up_and_move(
     bench.run(bench.drives.probe())
     bench.steps()
     assert {at: bench.insertion.value(*at) for at in wanted} == wanted
-    told = bench.drives.missing_optional_parts
-    assert told[0].startswith(f"insertion drive {missing}") if missing else told == ()
+    reported = bench.drives.missing_optional_parts
+    assert reported[0].startswith(f"insertion drive {missing}") if missing else reported == ()
 
 
 def test_parameters_override_reported_units() -> None:

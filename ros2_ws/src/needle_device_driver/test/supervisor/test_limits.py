@@ -62,8 +62,8 @@ def test_limits_are_finite_positive_and_capped() -> None:
 
 def test_notices_of_one_rule_are_limited_and_counted() -> None:
     limit, refused = NoticeLimit(), Notice("refused", Rule.TIP_AGE)
-    told = [limit.admit(refused, 100.0 + number * 1e-3) for number in range(999)]
-    assert [text for text in told if text] == ["refused [tip_age]"] * 5
+    texts = [limit.admit(refused, 100.0 + number * 1e-3) for number in range(999)]
+    assert [text for text in texts if text] == ["refused [tip_age]"] * 5
     assert limit.admit(Notice("late", Rule.HOLD_AGE), 100.9) == "late [hold_age]"
     assert limit.admit(Notice("stopped", Rule.TIP_AGE, fault=True), 100.9) == "stopped [tip_age]"
     assert limit.admit(Notice("by nobody"), 100.9) == "by nobody"

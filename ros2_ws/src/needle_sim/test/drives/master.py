@@ -36,7 +36,7 @@ class Master:
     def __init__(self, **motor: float) -> None:
         self.bus = EmulatedBus((settings("insertion", **motor), settings("rotation")), 0.0)
         self.now = 0.0
-        self.heard: list[CanFrame] = []
+        self.received: list[CanFrame] = []
         self.network = canopen.Network()
         self.network.bus = self  # type: ignore[assignment]  # all of a bus that canopen uses
         self.nodes = {n: self.network.add_node(n, None) for n in (INSERTION, ROTATION)}
@@ -48,15 +48,15 @@ class Master:
     def send(self, message: Any, timeout: float | None = None) -> None:
         data = bytes(message.data)
         frame = CanFrame(message.arbitration_id, data, bool(message.is_remote_frame))
-        self._hear(self.bus.receive((frame,), self.now))
-        self._hear(self.bus.poll(self.now))
+        self._receive(self.bus.receive((frame,), self.now))
+        self._receive(self.bus.poll(self.now))
 
     def shutdown(self) -> None:
         """Nothing to shut down."""
 
-    def _hear(self, frames: Sequence[CanFrame]) -> None:
+    def _receive(self, frames: Sequence[CanFrame]) -> None:
         for frame in frames:
-            self.heard.append(frame)
+            self.received.append(frame)
             self.network.notify(frame.identifier, bytearray(frame.data), self.now)
 
     # ---- interface for tests ------------------------------------------------------------------
@@ -65,10 +65,10 @@ class Master:
         end = self.now + seconds
         while self.now < end - 1e-9:
             self.now = min(self.now + 0.001, end)
-            self._hear(self.bus.poll(self.now))
+            self._receive(self.bus.poll(self.now))
 
     def frames(self, identifier: int) -> list[bytes]:
-        return [frame.data for frame in self.heard if frame.identifier == identifier]
+        return [frame.data for frame in self.received if frame.identifier == identifier]
 
     def read(self, index: int, subindex: int = 0, node: int = INSERTION) -> int:
         data = self.nodes[node].sdo.upload(index, subindex)

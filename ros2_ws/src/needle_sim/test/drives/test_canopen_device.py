@@ -33,7 +33,7 @@ def remap(master: Master, number: int, entries: list[int], kind: int, base: int 
 def test_each_drive_boots_identifies_itself_and_reboots_after_a_reset(
     master: Master,
 ) -> None:
-    assert [(frame.identifier, frame.data) for frame in master.heard[:2]] == [
+    assert [(frame.identifier, frame.data) for frame in master.received[:2]] == [
         (0x701, b"\0"),
         (0x702, b"\0"),
     ]
@@ -43,7 +43,7 @@ def test_each_drive_boots_identifies_itself_and_reboots_after_a_reset(
     assert master.read(0x1018, 4, ROTATION) == ROTATION
     default = master.read(0x6081)
     master.write(0x6081, 0, 4711, 4)
-    master.heard.clear()
+    master.received.clear()
     master.network.nmt.send_command(0x81)
     master.wait(0.31)
     assert master.frames(0x701) == [b"\0"]
@@ -92,9 +92,9 @@ def test_mapped_objects_are_sent_with_every_sync_and_others_on_change(master: Ma
     remap(master, 1, [0x60640020, 0x60410010], 1)
     # The default: the statusword on change.
     assert len(master.frames(0x181)) == 1
-    master.heard.clear()
+    master.received.clear()
     master.wait(0.2)
-    assert master.heard == []
+    assert master.received == []
     master.control(0x06)
     now = master.status().to_bytes(2, "little")
     master.sync(2)
@@ -120,9 +120,9 @@ def test_process_data_flow_in_operational_only_and_a_stopped_drive_answers_nothi
 ) -> None:
     remap(master, 1, [0x60640020], 1)
     master.network.nmt.send_command(0x80)
-    master.heard.clear()
+    master.received.clear()
     master.sync(3)
-    assert master.heard == []
+    assert master.received == []
     master.network.nmt.send_command(0x02)
     master.nodes[INSERTION].sdo.RESPONSE_TIMEOUT = 0.001
     with pytest.raises(canopen.SdoCommunicationError):
@@ -131,7 +131,7 @@ def test_process_data_flow_in_operational_only_and_a_stopped_drive_answers_nothi
 
 def test_a_heartbeat_comes_at_its_period_with_the_state(master: Master) -> None:
     master.write(0x1017, 0, 30, 2)
-    master.heard.clear()
+    master.received.clear()
     master.wait(0.3)
     beats = master.frames(0x701)
     assert len(beats) in (9, 10, 11)
@@ -148,7 +148,7 @@ def test_a_lost_heartbeat_of_the_master_is_an_emergency_and_a_fault(master: Mast
         master.network.send_message(0x700 + MASTER, b"\5")
         master.wait(0.09)
     assert master.state() == 0x27
-    master.heard.clear()
+    master.received.clear()
     master.wait(0.02)
     assert master.frames(0x81) == [bytes([0x30, 0x81, 0x11, 0, 0, 0, 0, 0])]
     assert master.read(0x603F) == 0x8130

@@ -255,7 +255,7 @@ def test_a_stalled_motor_is_a_following_error(master: Master) -> None:
     run_at(master, 400)
     master.bus.stall("insertion")
     at = master.true_counts()
-    master.heard.clear()
+    master.received.clear()
     for k in itertools.count(1):
         master.target(round(at) + 400 * k)
         master.sync()
@@ -281,7 +281,7 @@ def test_a_fault_brakes_and_is_reset_by_a_rising_edge(master: Master) -> None:
     assert master.read(0x6064) - before == pytest.approx(800, abs=1)
     master.control(0x0F)
     assert master.state() == 0x08
-    master.heard.clear()
+    master.received.clear()
     master.control(0x80)
     assert master.state() == 0x40
     assert master.frames(0x81) == [bytes(8)]
@@ -299,10 +299,10 @@ def test_a_hung_drive_is_silent_and_ends_at_its_set_point(
     master.enable(CSP)
     run_at(master, 800)
     master.bus.hang("insertion")
-    master.heard.clear()
+    master.received.clear()
     master.target(0, ROTATION)
     master.sync(20)
-    assert not [f for f in master.heard if f.identifier & 0x7F == INSERTION]
+    assert not [f for f in master.received if f.identifier & 0x7F == INSERTION]
     assert master.true_counts() == 8_000.0
     master.bus.restore(master.now)
     master.network.send_message(0x700 + MASTER, b"\5")

@@ -45,18 +45,18 @@ def typed(drives: DriveEmulator, *lines: str) -> list[Action]:
 def test_a_fault_happens_on_command_and_ends_with_restore(
     drives: DriveEmulator, line: str, happened: Callable[[EmulatedBus], bool]
 ) -> None:
-    (said, *_) = typed(drives, line)
-    assert said == Log("warning", f"on command: {line}, at 0.000000 mm, 0.000000 rad")
+    (log, *_) = typed(drives, line)
+    assert log == Log("warning", f"on command: {line}, at 0.000000 mm, 0.000000 rad")
     assert happened(drives.bus)
     typed(drives, "restore")
     assert happened(drives.bus) == line.startswith(("emcy", "reboot"))
 
 
 def test_the_adapter_is_unplugged_and_plugged_in_on_command(drives: DriveEmulator) -> None:
-    said = typed(drives, "unplug", "restore")
-    orders = [action.batch for action in said if isinstance(action, Send)]
+    actions = typed(drives, "unplug", "restore")
+    orders = [action.batch for action in actions if isinstance(action, Send)]
     assert orders == [(False,), (True,)]
-    assert {action.port for action in said if isinstance(action, Send)} == {ADAPTERS}
+    assert {action.port for action in actions if isinstance(action, Send)} == {ADAPTERS}
 
 
 def test_lines_that_are_no_commands_are_named_and_do_nothing(drives: DriveEmulator) -> None:
@@ -64,9 +64,9 @@ def test_lines_that_are_no_commands_are_named_and_do_nothing(drives: DriveEmulat
         *("explode", "stall", "stall both", "stall insertion now", "cut_bus now"),
         *("emcy insertion x", "emcy rotation 0x10000"),
     )
-    said = typed(drives, *bad)
-    assert [action.text.split("'")[1] for action in said if isinstance(action, Log)] == list(bad)
-    assert len(said) == len(bad)
+    actions = typed(drives, *bad)
+    assert [action.text.split("'")[1] for action in actions if isinstance(action, Log)] == list(bad)
+    assert len(actions) == len(bad)
     assert {drive.error_code for drive in drives.bus.drives.values()} == {0}
 
 

@@ -40,8 +40,8 @@ def test_stock_slcan_exchanges_frames_through_the_port(port: PtyCan) -> None:
         bus.send(can.Message(arbitration_id=0x201, data=b"\x0f\0", is_extended_id=False))
         assert received(port) == (CanFrame(0x201, b"\x0f\0"),)
         port.send([CanFrame(0x181, b"\x37\2"), CanFrame(0x701, b"\5")])
-        heard = [bus.recv(1.0) for _ in range(2)]
-    assert [(m.arbitration_id, bytes(m.data)) for m in heard if m is not None] == [
+        answers = [bus.recv(1.0) for _ in range(2)]
+    assert [(m.arbitration_id, bytes(m.data)) for m in answers if m is not None] == [
         (0x181, b"\x37\2"),
         (0x701, b"\5"),
     ]
@@ -68,20 +68,20 @@ def test_an_unplugged_adapter_is_an_error_and_comes_back(port: PtyCan) -> None:
 
 def test_a_port_is_read_until_it_is_closed(tmp_path: Path) -> None:
     adapter = PtyCan(tmp_path / "can")
-    heard: list[CanFrame] = []
+    received: list[CanFrame] = []
 
     def arrive(frames: tuple[CanFrame, ...]) -> None:
-        heard.extend(frames)
+        received.extend(frames)
         adapter.send((CanFrame(0x181, b"\1"),))
         message = bus.recv(1.0)
         assert message is not None
-        heard.append(CanFrame(message.arbitration_id, bytes(message.data)))
+        received.append(CanFrame(message.arbitration_id, bytes(message.data)))
         adapter.close()
 
     bus = computer(adapter)
     bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
     adapter.read(arrive)
-    assert heard == [CanFrame(0x80), CanFrame(0x181, b"\1")]
+    assert received == [CanFrame(0x80), CanFrame(0x181, b"\1")]
     assert list(tmp_path.iterdir()) == []
     bus.serialPortOrig.close()
     bus._is_shutdown = True

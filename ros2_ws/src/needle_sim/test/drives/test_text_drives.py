@@ -110,8 +110,8 @@ def test_each_axis_has_the_drives_of_its_name() -> None:
     moment = Moment(1.0, 1_000_000_000)
     sent = list(emulator.ports[0].handler((b"$0,I*55\n",), moment))
     assert sent == [Send("stepdir", (b"$0,I,Emulated stepdir,1,100000*21\n",))]
-    said = list(emulator.ports[2].handler(("emcy insertion 3", "reboot rotation"), moment))
-    states = [action.diagnostic.values for action in said if isinstance(action, Diagnose)]
+    actions = list(emulator.ports[2].handler(("emcy insertion 3", "reboot rotation"), moment))
+    states = [action.diagnostic.values for action in actions if isinstance(action, Diagnose)]
     assert states == [
         {"insertion": "FAULT 0x0003", "rotation": "NOT_READY"},
         {"insertion": "FAULT 0x0003", "rotation": "NOT_READY"},

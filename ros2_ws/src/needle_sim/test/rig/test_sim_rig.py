@@ -23,15 +23,15 @@ def made(**parameters: Any) -> SimRig:
 
 def run(rig: SimRig, begin: float, end: float) -> list[Any]:
     """Run both timers, cycles first; return the publications: topic and message."""
-    said: list[Action] = []
+    actions: list[Action] = []
     for tick in range(round(begin * 50), round(end * 50)):
         at = Moment(tick / 50, tick * 20_000_000)
         for timer in rig.timers:
-            said += timer.handler(at)
-    return [(one.topic, one.message) for one in said if isinstance(one, Publish)]
+            actions += timer.handler(at)
+    return [(one.topic, one.message) for one in actions if isinstance(one, Publish)]
 
 
-def hear(rig: SimRig, topic: str, message: Any) -> None:
+def receive(rig: SimRig, topic: str, message: Any) -> None:
     (row,) = (row for row in rig.inputs if row.topic == topic)
     assert list(row.handler(message, Moment(0.0, 0))) == []
 
@@ -39,7 +39,7 @@ def hear(rig: SimRig, topic: str, message: Any) -> None:
 def test_tips_are_within_their_noise_of_the_truth_and_another_seed_draws_others() -> None:
     first, other = (made(seed=seed, initial_pitch=0.035, initial_roll=0.26) for seed in (1, 2))
     for rig in (first, other):
-        hear(rig, "needle/controller_status", ControllerStatus(state="STEERING", awaiting="tip"))
+        receive(rig, "needle/controller_status", ControllerStatus(state="STEERING", awaiting="tip"))
     one, another = ([*run(rig, 0.0, 2.0)] for rig in (first, other))
     tips = [message for topic, message in one if topic == "needle/tip"]
     truths = {m.stamp_ns: m.position for topic, m in one if topic == "sim/tip_pose"}
@@ -60,14 +60,14 @@ def test_at_level_drive_motors_move_the_needle_and_its_exit_triggers_the_stop() 
     # Almost straight up: it leaves through the surface, 17.5 mm above.
     rig = made(level="drive", initial_pitch=1.4, curvature=0.0)
     names = (m.INSERTION_JOINT, m.ROTATION_JOINT)
-    said = []
+    published = []
     for second, insertion in ((0.0, 0.001), (1.5, 0.02)):
         place = m.JointState(0, names, (insertion, 0.0), (0.0, 0.0))
-        hear(rig, "sim/drive_positions", place)
-        said += run(rig, second, second + 1.5)
-    truth = next(message for topic, message in said if topic == "sim/tip_pose")
+        receive(rig, "sim/drive_positions", place)
+        published += run(rig, second, second + 1.5)
+    truth = next(message for topic, message in published if topic == "sim/tip_pose")
     assert math.hypot(truth.position[0], truth.position[2]) == pytest.approx(0.001)
-    assert [stop.pressed for topic, stop in said if topic == "device/estop"] == [True]
+    assert [stop.pressed for topic, stop in published if topic == "device/estop"] == [True]
 
 
 @pytest.mark.parametrize(

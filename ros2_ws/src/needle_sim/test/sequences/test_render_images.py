@@ -57,8 +57,8 @@ def test_the_folder_contains_the_rendered_images(tmp_path: Path) -> None:
     assert [float(truths[1][key]) for key in COORDINATES] == [*truth.tip, *angles]
     assert (float(truths[1]["left_seen"]), float(truths[1]["right_seen"])) == (1.0, 1.0)
     assert (output / "calibration.yaml").read_bytes() == CALIBRATION.read_bytes()
-    told = json.loads(done.read_text())
-    assert (told["scenario"], told["frames"], told["seed"]) == ("clean", 2, 7)
+    summary = json.loads(done.read_text())
+    assert (summary["scenario"], summary["frames"], summary["seed"]) == ("clean", 2, 7)
 
 
 def test_without_a_needle_there_is_no_truth_and_the_first_frame_may_be_deep_in(

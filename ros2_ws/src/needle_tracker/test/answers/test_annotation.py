@@ -98,10 +98,10 @@ def test_counts_include_all_processed_pairs() -> None:
         *[Measurement(None, TrackState.ENTRY, "")] * 5,
     ):
         counts.add(measured)
-    said = counts.describe().splitlines()
-    assert said[0].endswith("left : end seen in 4 of 4 pairs, shaft in 4")
-    assert said[1].endswith("right: end seen in 1 of 4 pairs, shaft in 4")
-    assert said[2].endswith("5 x  in the entry zone")
+    lines = counts.describe().splitlines()
+    assert lines[0].endswith("left : end seen in 4 of 4 pairs, shaft in 4")
+    assert lines[1].endswith("right: end seen in 1 of 4 pairs, shaft in 4")
+    assert lines[2].endswith("5 x  in the entry zone")
     assert counts.figures()["right_end_seen"] == 1
 
 

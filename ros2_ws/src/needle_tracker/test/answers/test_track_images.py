@@ -120,22 +120,22 @@ def test_every_pair_has_a_line_and_unusable_images_are_named(
     assert [row["name"] for row in rows] == [f"image_{mm}.png" for mm in (3, 50, 51, 52, 60)]
     # 3 mm follows from the stage alone, which is not a measurement.
     assert [row["valid"] for row in rows] == ["0", "1", "0", "0", "0"]
-    told = [row["missing"] for row in rows]
+    missing = [row["missing"] for row in rows]
     unusable = ["left image is unreadable or not of 8 bit"]
     unusable.append("right image is 640x480, the calibration is for 1024x768")
-    assert told == ["in the entry zone", "", *unusable, "left image is black"]
+    assert missing == ["in the entry zone", "", *unusable, "left image is black"]
     assert not any(rows[0][column] for column in COLUMNS[2:-1])
     found = {column: float(rows[1][column]) for column in COLUMNS[2:10]}
     sigmas = {f"sigma_{axis}_m": SIGMA for axis in "xyz"}
     place = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.05, "pitch_rad": 0.1, "yaw_rad": math.atan(0.25)}
     assert found == pytest.approx(place | sigmas)
-    said = capsys.readouterr()
+    captured = capsys.readouterr()
     for name in ("left image_53.png", "image_51.png (left", "image_52.png (right image is 640x480"):
-        assert name in said.err
-    assert "1 x  left image is black" in said.out
-    told = json.loads((folder / "o.json").read_text())
-    assert (told["pairs"], told["tips"], told["without_insertion"]) == (5, 1, 1)
-    assert (told["unpaired"], told["unreadable"], told["compared"]) == (1, 2, None)
+        assert name in captured.err
+    assert "1 x  left image is black" in captured.out
+    summary = json.loads((folder / "o.json").read_text())
+    assert (summary["pairs"], summary["tips"], summary["without_insertion"]) == (5, 1, 1)
+    assert (summary["unpaired"], summary["unreadable"], summary["compared"]) == (1, 2, None)
     # Images at 3 and 50 mm are not one sequence of a needle.
     assert len(Scripted.resets) == 1
 
@@ -174,7 +174,7 @@ NODE = "stereo_tracker: {ros__parameters: {%s}}"
 
 def test_unusable_input_is_reported_in_one_line(track: Track, folder: Path, capsys: Out) -> None:
     given = folder / "given.txt"
-    for option, text, says in (
+    for option, text, cause in (
         ("--params", NODE % "needle_widht: 0.001", "needle_widht"),
         ("--params", NODE % "reference_folder: /nowhere", "/nowhere"),
         ("--insertion", "name,insertion\na,1\n", "insertion_m"),
@@ -191,7 +191,7 @@ def test_unusable_input_is_reported_in_one_line(track: Track, folder: Path, caps
         code, rows = track(option, "given.txt")
         error = capsys.readouterr().err
         assert (code, rows, error.count("\n")) == (2, [], 1)
-        assert any(one in error for one in says.split("|")), error
+        assert any(one in error for one in cause.split("|")), error
 
 
 def test_wrong_options_are_reported_in_one_line(track: Track, folder: Path, capsys: Out) -> None:
@@ -226,14 +226,14 @@ def test_tips_are_compared_with_the_truth(track: Track, folder: Path, capsys: Ou
     (folder / "truth.csv").write_text(TRUTH + "\n".join(lines) + "\n")
     words = ("--truth", "truth.csv", "--json", "o.json")
     assert track(*words)[0] == 0
-    told = json.loads((folder / "o.json").read_text())
+    summary = json.loads((folder / "o.json").read_text())
     keys = ("compared", "missed", "tips_without_needle", "without_truth")
-    assert [told[key] for key in keys] == [2, 0, 1, 1]
-    assert told["error_rms_mm"] == told["error_z_rms_mm"] == pytest.approx(math.sqrt(0.5))
-    assert (told["error_max_mm"], told["error_x_rms_mm"]) == pytest.approx((1.0, 0.0))
+    assert [summary[key] for key in keys] == [2, 0, 1, 1]
+    assert summary["error_rms_mm"] == summary["error_z_rms_mm"] == pytest.approx(math.sqrt(0.5))
+    assert (summary["error_max_mm"], summary["error_x_rms_mm"]) == pytest.approx((1.0, 0.0))
     # A millimetre is ten standard deviations.
-    assert told["error_sigmas"] == pytest.approx(math.sqrt(100.0 / 2.0 / 3.0))
-    assert told["inside_95"] == 0.5
+    assert summary["error_sigmas"] == pytest.approx(math.sqrt(100.0 / 2.0 / 3.0))
+    assert summary["inside_95"] == 0.5
     assert "error  0.707 mm rms" in capsys.readouterr().out
     save(folder / "left" / "image_50.png", 0)
     assert track(*words)[0] == 0

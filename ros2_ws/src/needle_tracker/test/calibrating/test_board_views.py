@@ -72,7 +72,7 @@ def another_board(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "says"),
+    ("spoil", "cause"),
     [
         (drop("left/free_1.png"), r"without a partner \(1\): right free_1.png"),
         (write("right/top.png", np.zeros((48, 64), np.uint8)), "top.png is 64x48"),
@@ -82,10 +82,10 @@ def another_board(folder: Path) -> None:
     ],
 )
 def test_unsuitable_folders_are_rejected(
-    folder: Path, spoil: Callable[[Path], object], says: str
+    folder: Path, spoil: Callable[[Path], object], cause: str
 ) -> None:
     spoil(folder)
-    with pytest.raises(UserError, match=says):
+    with pytest.raises(UserError, match=cause):
         views_in_folders(folder / "left", folder / "right", SESSION)
 
 

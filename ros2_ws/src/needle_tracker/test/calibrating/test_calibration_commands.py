@@ -90,9 +90,9 @@ def test_a_written_calibration_passes_its_check(
     assert capsys.readouterr().out.endswith("OK\n")
     assert json.loads(figures.read_text())["ok"] is True
 
-    said = yaml.safe_load(output.read_text())
-    said["phantom"]["refractive_index"] += 0.01
-    output.write_text(yaml.safe_dump(said))
+    calibration = yaml.safe_load(output.read_text())
+    calibration["phantom"]["refractive_index"] += 0.01
+    output.write_text(yaml.safe_dump(calibration))
     assert check_calibration(words) == 1
     values = json.loads(figures.read_text())
     assert values["ok"] is False

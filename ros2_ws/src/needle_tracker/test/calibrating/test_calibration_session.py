@@ -20,19 +20,19 @@ FLAT = {"origin": [0.018, -0.04, 0.01]}
 
 def entry(place: Place) -> dict[str, Any]:
     T = place.T_rig_board
-    said = {"origin": T[:3, 3].tolist(), "columns": T[:3, 0].tolist(), "rows": T[:3, 1].tolist()}
-    return said | {"under_surface": place.under_surface, "sigma": place.sigma}
+    content = {"origin": T[:3, 3].tolist(), "columns": T[:3, 0].tolist(), "rows": T[:3, 1].tolist()}
+    return content | {"under_surface": place.under_surface, "sigma": place.sigma}
 
 
 def box_content(**places: Any) -> dict[str, Any]:
     """Return a session file with a window for each camera instead of the phantom."""
-    said = session_content(**places)
-    del said["phantom"]
+    content = session_content(**places)
+    del content["phantom"]
     for side, window in zip(SIDES, GIVEN_BOX, strict=True):
         values = {"point": window.point.tolist(), "normal": window.normal.tolist()}
         layers = [dataclasses.asdict(layer) for layer in window.layers]
-        said[side] = {"window": values | {"layers": layers, "inside": window.inside}}
-    return said
+        content[side] = {"window": values | {"layers": layers, "inside": window.inside}}
+    return content
 
 
 def test_a_session_is_read(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_places_are_found_by_name_or_pattern_and_lie_flat_by_default() -> None:
 
 def test_a_wrong_place_is_named() -> None:
     place: dict[str, Any]
-    for place, says in (
+    for place, cause in (
         ({}, "places.a.origin"),
         (FLAT | {"colums": [0, 0, 1]}, "unknown key 'colums'"),
         (FLAT | {"columns": [0, 1, 1]}, "right angles"),
@@ -84,14 +84,14 @@ def test_a_wrong_place_is_named() -> None:
         ({"origin": [0.0, 0, 0], "under_surface": "yes"}, "not true or false"),
         ({"under_surface": True, "sigma": 1e-4}, "places.a.origin"),
     ):
-        with pytest.raises(UserError, match=says):
+        with pytest.raises(UserError, match=cause):
             parse_session(session_content(a=place))
-    for place, says in (
+    for place, cause in (
         # In a box, level, print up: the camera at the side sees the board edge-on.
         ({"origin": [0.0, -0.04, 0.01]}, "away from the camera"),
         ({"origin": [0.03, -0.01, 0.01], "rows": [-1, 1, 0]}, "above the surface"),
     ):
-        with pytest.raises(UserError, match=says):
+        with pytest.raises(UserError, match=cause):
             parse_session(box_content(a=place | {"under_surface": True}))
     with pytest.raises(UserError, match="the file is missing or not a mapping"):
         parse_session([])

@@ -34,14 +34,14 @@ def test_corners_are_found_where_they_are_drawn() -> None:
 
 def test_an_impossible_board_is_rejected() -> None:
     wrong: dict[str, Any]
-    for wrong, says in (
+    for wrong, cause in (
         ({"columns": 2}, "board.columns"),
         ({"square": 1.0}, "board.square"),
         ({"marker": 0.02}, "board.marker"),
         ({"dictionary": "DICT_9X9"}, "dictionary"),
         ({"dictionary": "DICT_4X4_50"}, "54 markers"),
     ):
-        with pytest.raises(UserError, match=says):
+        with pytest.raises(UserError, match=cause):
             CharucoBoard(**wrong)
 
 

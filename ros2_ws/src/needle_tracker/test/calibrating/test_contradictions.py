@@ -55,7 +55,7 @@ def test_one_place_does_not_determine_the_size_of_the_squares(
 
 
 @pytest.mark.parametrize(
-    ("name", "shift", "says"),
+    ("name", "shift", "text"),
     [
         # Index and surface absorb most of the error, so tips are equally wrong.
         ("under_deep", [1e-3, 0.0, 0.0], "under_deep is 0."),
@@ -63,7 +63,7 @@ def test_one_place_does_not_determine_the_size_of_the_squares(
     ],
 )
 def test_a_wrong_place_is_found(
-    views: list[BoardView], calibration: StereoCalibration, name: str, shift: list[float], says: str
+    views: list[BoardView], calibration: StereoCalibration, name: str, shift: list[float], text: str
 ) -> None:
     number = next(i for i, view in enumerate(views) if view.name == name)
     place = views[number].place
@@ -73,7 +73,7 @@ def test_a_wrong_place_is_found(
     wrong = dataclasses.replace(views[number], place=dataclasses.replace(place, T_rig_board=pose))
     found = [*views[5:number], wrong, *views[number + 1 :]]
     result = calibrate(found, SIZES, GIVEN, lenses_of(calibration))
-    assert any(says in one for one in contradictions(result, square_error(result)))
+    assert any(text in one for one in contradictions(result, square_error(result)))
 
 
 def test_a_lens_that_plumb_bob_does_not_describe_is_not_ok(result: RigCalibration) -> None:
@@ -83,9 +83,9 @@ def test_a_lens_that_plumb_bob_does_not_describe_is_not_ok(result: RigCalibratio
     residuals[-out.size :] += (0.05 * np.sin(away / 50.0) * out / away).ravel()
     bent = dataclasses.replace(result, fit=dataclasses.replace(result.fit, residuals=residuals))
     assert 0.03 < ring_patterns(bent)["right"] < 0.06
-    (said,) = contradictions(bent, (0.0, np.inf))
-    assert "right camera: corners are off by up to 0.0" in said
-    assert "in a pattern of rings: its lens has more" in said
+    (text,) = contradictions(bent, (0.0, np.inf))
+    assert "right camera: corners are off by up to 0.0" in text
+    assert "in a pattern of rings: its lens has more" in text
 
 
 FREE = 6

@@ -134,7 +134,7 @@ def test_single_camera_files_of_opencv_have_no_relative_pose(
 def test_an_unusable_chain_is_rejected_with_the_reason(
     tmp_path: Path, calibration: StereoCalibration
 ) -> None:
-    for camera, changes, says in (
+    for camera, changes, cause in (
         ("cam0", {"camera_model": "omni"}, "cam0.camera_model 'omni' is not supported"),
         ("cam0", {"distortion_model": "fov"}, "fov with 4 coefficients"),
         ("cam0", {"distortion_coeffs": [0.1] * 6}, "radtan with 6 coefficients"),
@@ -152,7 +152,7 @@ def test_an_unusable_chain_is_rejected_with_the_reason(
         chain[camera].update(changes or {})
         if changes is None:
             del chain[camera]
-        with pytest.raises(UserError, match=re.escape(says)):
+        with pytest.raises(UserError, match=re.escape(cause)):
             read(written(tmp_path / "chain.yaml", chain))
 
 
@@ -162,14 +162,14 @@ def test_files_that_are_not_two_cameras_are_rejected(
     ros_files, chain, split, *_ = all_formats(tmp_path, calibration).values()
     broken = tmp_path / "broken.yml"
     broken.write_text(split[1].read_text().replace("data: [", "data: ["[:-1] + "{"))
-    for paths, says in (
+    for paths, cause in (
         (ros_files[:1] * 2, "a file is given twice"),
         (ros_files + chain, "found 4 of 2 cameras"),
         (split[:1], "found 0 of 2 cameras"),
         ([broken], "it is damaged"),
         ([written(tmp_path / "own.yaml", {"phantom": {}})], "is neither a ROS camera_info"),
     ):
-        with pytest.raises(UserError, match=says):
+        with pytest.raises(UserError, match=cause):
             read(*paths)
 
 
@@ -198,8 +198,8 @@ def test_lenses_of_other_cameras_or_in_another_unit_are_rejected(
     pose = np.array(far["cam1"]["T_cn_cnm1"])
     far["cam1"]["T_cn_cnm1"] = (pose * [1.0, 1.0, 1.0, 1e3]).tolist()
     swapped["cam1"]["T_cn_cnm1"] = np.linalg.inv(pose).tolist()
-    for chain, says in ((far, "is T in metres"), (swapped, "are left and right exchanged")):
-        with pytest.raises(UserError, match=says):
+    for chain, cause in ((far, "is T in metres"), (swapped, "are left and right exchanged")):
+        with pytest.raises(UserError, match=cause):
             calibrate(views[4:7], SIZES, GIVEN, read(written(tmp_path / "chain.yaml", chain)))
     for camera in ("cam0", "cam1"):
         longer[camera]["intrinsics"][0] *= 1.01
@@ -207,6 +207,6 @@ def test_lenses_of_other_cameras_or_in_another_unit_are_rejected(
     given = read(written(tmp_path / "chain.yaml", longer))
     places = {name: place for name, place in PLACES.items() if name != "surface_b"}
     result = calibrate(take(rig, free=0, places=places), SIZES, GIVEN, given)
-    said = contradictions(result, square_error(result))
-    assert any("another camera, focus or image size" in text for text in said)
-    assert not any("more distortion" in text for text in said)
+    texts = contradictions(result, square_error(result))
+    assert any("another camera, focus or image size" in text for text in texts)
+    assert not any("more distortion" in text for text in texts)

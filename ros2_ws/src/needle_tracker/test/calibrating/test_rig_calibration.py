@@ -196,7 +196,7 @@ def test_sets_that_cannot_determine_the_rig_are_rejected(
     level = [view_of(rig, f"level_{i}", free_pose(rng, (0.0, 0.5)), None, rng) for i in range(6)]
     alone = [v for v in box_views if v.place is None and not len(v.left.points)]
     assert len(alone) >= 5
-    for found, given, says in (
+    for found, given, cause in (
         (views[1:], GIVEN, "5 views of the board held freely"),
         (without(views, 0, "right", 0), GIVEN, "the right camera sees 0 corners"),
         (without(views, 0, "left", 11), GIVEN, "the left camera sees 11 corners.* 12 are needed"),
@@ -207,7 +207,7 @@ def test_sets_that_cannot_determine_the_rig_are_rejected(
         ([v for v in box_views if v.place is not STANDS], GIVEN_BOX, "is undetermined"),
         (without(box_views, 13, "right", 0), GIVEN_BOX, "box_00: the right camera sees 0 corners"),
     ):
-        with pytest.raises(UserError, match=says) as caught:
+        with pytest.raises(UserError, match=cause) as caught:
             calibrate(found, SIZES, given)
         assert "\n" not in str(caught.value)
     same = [dataclasses.replace(view, right=view.left) for view in views[4:]]

@@ -95,27 +95,27 @@ def test_without_the_insertion_no_tip_over_graph_paper_is_immediate_or_wrong(
         assert tip is None or np.linalg.norm(tip.position - truth) < 0.75e-3
 
 
-TOLD = [
+KNOWN = [
     {"empty": True, "insertion": True},
     {"empty": False, "insertion": True},
     {"empty": False, "insertion": False},
 ]
 
 
-@pytest.mark.parametrize("told", TOLD)
+@pytest.mark.parametrize("known", KNOWN)
 @pytest.mark.parametrize("name", ["box_steel", "box_clutter"])
 def test_a_needle_in_a_box_before_clutter_is_found_through_its_walls(
-    calibration: StereoCalibration, name: str, told: dict[str, bool]
+    calibration: StereoCalibration, name: str, known: dict[str, bool]
 ) -> None:
-    for tip, truth in tracked(calibration, name, **told)[2:]:
+    for tip, truth in tracked(calibration, name, **known)[2:]:
         assert tip is not None
         off = tip.position - truth
         assert np.linalg.norm(off) < 0.5e-3
         assert off @ np.linalg.solve(tip.covariance, off) < _CHI_SQUARED_999
 
 
-@pytest.mark.parametrize("told", TOLD)
+@pytest.mark.parametrize("known", KNOWN)
 def test_old_tracks_and_rails_behind_a_box_are_no_needle(
-    calibration: StereoCalibration, told: dict[str, bool]
+    calibration: StereoCalibration, known: dict[str, bool]
 ) -> None:
-    assert not any(tip for tip, _ in tracked(calibration, "box_empty", **told))
+    assert not any(tip for tip, _ in tracked(calibration, "box_empty", **known))

@@ -155,7 +155,7 @@ def test_wrong_sources_are_rejected(tmp_path: Path) -> None:
     left, right = write_pairs(tmp_path / "good", 2)
     other = write_pairs(tmp_path / "large", 2, (80, 60))[0]
     (tmp_path / "empty").mkdir()
-    for pair, says in (
+    for pair, cause in (
         (("", right), "left is empty"),
         ((left, tmp_path / "none"), "does not exist"),
         ((left, tmp_path / "empty"), "no images"),
@@ -165,7 +165,7 @@ def test_wrong_sources_are_rejected(tmp_path: Path) -> None:
         ((left, other), "80x60"),
         (("/dev/null", "/dev/zero"), "left camera /dev/null cannot be opened"),
     ):
-        with pytest.raises(UserError, match=says):
+        with pytest.raises(UserError, match=cause):
             opened(*pair)
     (left / "000.png").unlink()
     with pytest.raises(UserError, match=r"right 000\.png"):

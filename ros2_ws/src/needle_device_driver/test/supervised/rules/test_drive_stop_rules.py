@@ -99,16 +99,16 @@ def test_quick_stop_ignored_after_estop_is_reported_while_it_lasts(
         setattr(drive, attribute, value)
     bench.supervisor.receive_estop(True)
     assert bench.status.fault == "emergency stop"
-    told = []
+    faults = []
     for number, what in cycles:
         for _ in range(number):
             bench.wait()
-            told += [bench.status.fault] * (bench.status.fault not in told)
+            faults += [bench.status.fault] * (bench.status.fault not in faults)
         suffix = f"; {which} axis {what}" if what else ""
         assert bench.status.fault == f"emergency stop{suffix}"
     assert drive.state == end
-    said = [str(notice) for notice in bench.notices if notice.fault][1:]
-    assert said == [f"{fault[16:]} [quick_stop]" for fault in told[1:]]
+    reported = [str(notice) for notice in bench.notices if notice.fault][1:]
+    assert reported == [f"{fault[16:]} [quick_stop]" for fault in faults[1:]]
     # The report ends with the cause, and with a reset.
     bench.supervisor.receive_estop(False)
     bench.hold(False)

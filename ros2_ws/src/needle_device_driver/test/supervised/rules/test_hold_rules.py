@@ -96,8 +96,8 @@ def test_hold_age_gap_between_cycles_counts() -> None:
         bench.now += 0.3
         come_back()
         assert (bench.status.hold_owner, bench.state) == ("", "HOLDING")
-        told = [notice.rule.value for notice in bench.notices if notice.rule]
-        assert told.count("hold_age") == number + 1
+        rules = [notice.rule.value for notice in bench.notices if notice.rule]
+        assert rules.count("hold_age") == number + 1
     assert bench.status.watchdog_trips == 0, "nothing moved"
 
 
@@ -315,11 +315,11 @@ def test_command_newer_hint_on_time_that_went_back() -> None:
     last = bench.step()
     bench.go(25)
     # Within the tolerated lead, time did not go back.
-    for back_ns, told in ((-MS, False), (0, False), (100 * MS, False), (100 * MS + 1, True)):
+    for back_ns, reported in ((-MS, False), (0, False), (100 * MS, False), (100 * MS + 1, True)):
         bench.supervisor.note_time(last - back_ns, bench.now)
         bench.step(stamp_ns=last)
         assert bench.rule == "command_newer"
-        assert ("ROS time jumped back" in bench.outcomes[-1]) is told, back_ns
+        assert ("ROS time jumped back" in bench.outcomes[-1]) is reported, back_ns
 
 
 def test_command_newer_stamps_are_used_once() -> None:

@@ -209,11 +209,11 @@ def test_homing_time_stops_a_drive_that_moves_away_from_its_switch(
         assert text in until_fault(bench, "homing_time")
         assert 10_000 < abs(bench.insertion.position) <= 10_000 + 3 * MM_S, "0.5 mm, two cycles"
     # Off its switch the axis moves the other way; a drive without inputs is not checked.
-    for tells in (True, False):
+    for works in (True, False):
         bench = DriveBench(insertion_homing_method=method)
-        if not tells:
+        if not works:
             bench.insertion.missing_objects = {0x60FD}
-        bench.insertion.inputs = switch * tells
+        bench.insertion.inputs = switch * works
         bench.insertion.searches(forever=away * MM_S)
         bench.homing()
         bench.wait(10)
