@@ -91,7 +91,7 @@ def steer(
         camera_rate=FRAME_RATE,
     )
     sim = _SteeredRig(needle, new_sensor=new_sensor)
-    driver = {"max_depth": steering.depth + 0.01, "insertion_drive": "hand" if pushed else "motor"}
+    driver = {"max_depth": steering.depth + 0.01, "insertion_drive": "hand" if pushed else "cia402"}
     late = (delay("needle/tip", latency),)
     rig = VirtualRig(seed, sim, PlaneController(steering), driver=driver, faults=late)
     rig.home()
