@@ -81,7 +81,7 @@ def run_until_sigterm(names: Collection[str], folder: Path, listener: Node) -> N
         assert started - set(listener.get_node_names()) == set()
         for node in nodes:
             node.signal_group(signal.SIGTERM)
-        assert wait_for(nodes, PATIENCE) == []
+        assert [node.name for node in wait_for(nodes, PATIENCE)] == []
     finally:
         stop(nodes)
     for node in nodes:
