@@ -49,27 +49,27 @@ def test_a_patch_at_the_border_is_whole(place: tuple[float, float]) -> None:
     assert (Cut(np.array(place), 0.4, 0.7).image(image) == 77).all()
 
 
-def test_a_sample_and_its_labels_are_rotated_and_scaled_alike() -> None:
+@pytest.mark.parametrize("width_px", [4.0, 10.0])
+def test_a_sample_and_its_labels_are_rotated_and_scaled_alike(width_px: float) -> None:
     with_needle = ends = 0
-    for width_px in (4.0, 10.0):
-        scene = bars(width_px)
-        for seed in range(40):
-            sample = traced_patch(np.random.default_rng(seed), [scene])
-            share, image = sample.share / 255.0, sample.image.astype(float)
-            assert image.shape == share.shape == (CANVAS, CANVAS)
-            if (share > 0.95).sum() < 60:
-                continue
-            with_needle += 1
-            # With every camera, the needle is brighter than its surroundings.
-            assert image[share > 0.95].mean() > image[share < 0.01].mean()
-            if (np.abs(sample.end - 0.5 * CANVAS) < 0.5 * SIZE - 12).all():
-                ends += 1
-                column, row = np.rint(sample.end).astype(int)
-                around = share[row - 6 : row + 7, column - 6 : column + 7]
-                # A shaft that ends there fills less than half of what is around.
-                assert 0.02 < around.mean() < 0.62
-    assert with_needle > 20
-    assert ends > 10
+    scene = bars(width_px)
+    for seed in range(40):
+        sample = traced_patch(np.random.default_rng(seed), [scene])
+        share, image = sample.share / 255.0, sample.image.astype(float)
+        assert image.shape == share.shape == (CANVAS, CANVAS)
+        if (share > 0.95).sum() < 60:
+            continue
+        with_needle += 1
+        # With every camera, the needle is brighter than its surroundings.
+        assert image[share > 0.95].mean() > image[share < 0.01].mean()
+        if (np.abs(sample.end - 0.5 * CANVAS) < 0.5 * SIZE - 12).all():
+            ends += 1
+            column, row = np.rint(sample.end).astype(int)
+            around = share[row - 6 : row + 7, column - 6 : column + 7]
+            # A shaft that ends there fills less than half of what is around.
+            assert 0.02 < around.mean() < 0.62
+    assert with_needle > 10
+    assert ends > 5
 
 
 def test_half_of_the_samples_have_a_background_of_the_same_camera() -> None:
