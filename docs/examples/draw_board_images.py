@@ -35,7 +35,8 @@ def drawn(
     sides = (np.linspace(-1.0, n + 1.0, 4 * (n + 2) + 1) for n in (board.columns, board.rows))
     mesh = np.stack(np.meshgrid(*sides), axis=-1)
     flat = np.dstack([mesh * board.square, np.zeros(mesh.shape[:2])]).reshape(-1, 3)
-    pixels = boards.pixels_of(camera, flat @ pose[:3, :3].T + pose[:3, 3], under).reshape(mesh.shape)
+    points = flat @ pose[:3, :3].T + pose[:3, 3]
+    pixels = boards.pixels_of(camera, points, under).reshape(mesh.shape)
     target = ((pixels + 0.5) * FINER - 0.5).astype(np.float32)
     source = ((mesh + 1.0) * SQUARE - 0.5).astype(np.float32)
     size = np.array([camera.image_width, camera.image_height])
