@@ -6,7 +6,6 @@ SESSION is a session file (docs/calibration.md), for cameras that look through o
 NEW_FOLDER gets left, right and a copy of it.
 """
 
-import importlib
 import shutil
 import sys
 from pathlib import Path
@@ -23,7 +22,8 @@ FREE_VIEWS = 12
 TRACKER = Path(__file__).resolve().parents[2] / "ros2_ws" / "src" / "needle_tracker"
 # The boards that the calibration is tested on: their rays are traced by other code than its own.
 sys.path.insert(0, str(TRACKER.parents[2] / "tests" / "shared"))
-boards = importlib.import_module("synthetic_rig")
+import synthetic_rig as boards  # noqa: E402
+
 SQUARE, FINER = 80, 2  # [px] of a drawn square; how many times finer than the camera's it is drawn
 
 
@@ -57,7 +57,8 @@ def drawn(
         block[inside > 0] = 30.0 + patch[inside > 0] * (190.0 / 255.0)
     image = cv2.GaussianBlur(image, (0, 0), 0.7 * FINER)
     small = cv2.resize(image, size.tolist(), interpolation=cv2.INTER_AREA)
-    return np.clip(np.round(small + rng.normal(0.0, 2.0, small.shape)), 0, 255).astype(np.uint8)
+    noisy = np.round(small + rng.normal(0.0, 2.0, small.shape))
+    return np.asarray(np.clip(noisy, 0, 255), np.uint8)
 
 
 if len(sys.argv) != 3:

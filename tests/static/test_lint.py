@@ -47,8 +47,9 @@ def test_types_of_a_package(package: Path) -> None:
 
 
 @on_typed_numpy
-def test_types_of_scripts_and_their_tests() -> None:
-    passes("-m", "mypy", ROOT / "scripts/lib", ROOT / "tests")
+def test_types_of_scripts_tests_and_an_example_that_uses_them() -> None:
+    example = ROOT / "docs/examples/draw_board_images.py"
+    passes("-m", "mypy", ROOT / "scripts/lib", ROOT / "tests", example)
 
 
 def test_import_walls() -> None:
