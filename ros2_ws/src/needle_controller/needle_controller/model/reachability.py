@@ -119,32 +119,6 @@ def least_insertion(
     return np.asarray(np.where(np.abs(excess) <= 0.0, level, length))
 
 
-def farthest_offsets(
-    pitch: npt.ArrayLike, curvature: npt.ArrayLike, length: npt.ArrayLike
-) -> tuple[Array, Array]:
-    """Return the range of planes that can be reached within an insertion.
-
-    Parameters
-    ----------
-    pitch : array_like, shape (...)
-        Pitch of the needle in the planes' coordinates [rad].
-    curvature : array_like, shape (...)
-        kappa [1/m].
-    length : array_like, shape (...)
-        Remaining insertion, >= 0 [m].
-
-    Returns
-    -------
-    lowest, highest : ndarray, shape (...)
-        Offsets of planes from the tip along their x axis [m]; NaN if the length is too short for
-        levelling out.
-    """
-    pitch, curvature = np.asarray(pitch, dtype=float), np.asarray(curvature, dtype=float)
-    length = np.asarray(length, dtype=float)
-    highest = _highest(pitch, curvature, length)
-    return -_highest(-pitch, curvature, length), highest
-
-
 def check_plane(plane: TargetPlane, curvature: float, depth: float) -> None:
     """Check that a needle that is not yet inserted can be steered into a plane.
 
@@ -160,32 +134,16 @@ def check_plane(plane: TargetPlane, curvature: float, depth: float) -> None:
     Raises
     ------
     UserError
-        The plane is out of reach; the message gives the range of reachable planes and the insertion
-        that this one needs.
+        The plane is out of reach; the message gives the insertion that it needs.
     """
     offset, depth = plane.offset, max(depth, SHORTEST_CHECKED_DEPTH)
     pitch = float(np.arcsin(np.clip(plane.T_plane_rig[0, 2], -1.0, 1.0)))
-    lowest, highest = (float(limit) for limit in farthest_offsets(pitch, curvature, depth))
-    if lowest <= offset <= highest:
-        return
     needed = float(least_insertion([-offset, pitch, 0.0], curvature))
-    reach = "no plane"
-    if math.isfinite(lowest):
-        reach = f"planes from {lowest:.4g} to {highest:.4g} m"
-    raise UserError(
-        f"target plane at {offset:.4g} m cannot be reached: with curvature {curvature:.4g} 1/m and "
-        f"depth {depth:.4g} m the needle reaches {reach}; this one takes {needed:.4g} m"
-    )
-
-
-def _highest(pitch: Array, curvature: Array, length: Array) -> Array:
-    limit = np.maximum(LARGEST_PITCH, pitch)
-    top = np.minimum(0.5 * (curvature * length + pitch), limit)
-    straight = length - (2.0 * top - pitch) / curvature
-    offset = (np.cos(pitch) - 2.0 * np.cos(top) + 1.0) / curvature + straight * np.sin(limit)
-    # Levelling out immediately takes at least |pitch| / kappa.
-    possible = curvature * length >= np.abs(pitch) - 1e-12
-    return np.asarray(np.where(possible, offset, np.nan))
+    if needed > depth:
+        raise UserError(
+            f"target plane at {offset:.4g} m cannot be reached: with curvature {curvature:.4g} 1/m "
+            f"it takes {needed:.4g} m of insertion, depth is {depth:.4g} m"
+        )
 
 
 def point_reachability(

@@ -13,7 +13,6 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.reachability import (
     LARGEST_PITCH,
     check_point,
-    farthest_offsets,
     least_insertion,
     least_insertion_to_point,
     point_reachability,
@@ -41,7 +40,7 @@ def test_the_plant_reaches_the_plane_in_the_least_insertion() -> None:
     assert float(plant.insertion) == pytest.approx(least, abs=1e-12)
 
 
-def test_random_rolls_never_exceed_the_farthest_offsets_which_need_all_insertion() -> None:
+def test_no_path_of_random_rolls_is_shorter_than_the_least_insertion() -> None:
     rng, count, h = default_rng(1), 5_000, 0.06 / 240
     x, pitch, sine = np.zeros(count), np.full(count, 0.1), np.zeros(count)
     for k in range(240):
@@ -49,13 +48,9 @@ def test_random_rolls_never_exceed_the_farthest_offsets_which_need_all_insertion
         x = x + h * np.sin(pitch + 0.5 * h * CURVATURE * sine)
         pitch = pitch + h * CURVATURE * sine
     level = np.abs(pitch) < 0.02
-    lowest, highest = farthest_offsets(0.1, CURVATURE, 0.06 + 0.02 / CURVATURE)
     assert np.sum(level) > 100
-    assert np.all((x[level] > lowest) & (x[level] < highest))
-    for start, far in ((0.0, 0.12), (-0.3, 0.1), (0.0, 0.6)):
-        for offset in farthest_offsets(start, CURVATURE, far):
-            least = least_insertion([-float(offset), start, 0.0], CURVATURE)
-            assert float(least) == pytest.approx(far, rel=1e-9)
+    start = np.stack([-x[level], np.full(level.sum(), 0.1), np.zeros(level.sum())], axis=-1)
+    assert np.all(least_insertion(start, CURVATURE) < 0.06 + 0.02 / CURVATURE)
 
 
 def test_the_largest_pitch_adds_a_straight_part() -> None:
