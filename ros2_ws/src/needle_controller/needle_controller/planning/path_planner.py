@@ -19,6 +19,7 @@ from needle_controller.planning.flood_fill import may_have_path
 from needle_controller.planning.legs import MOST_POINTS, leg_towards, trace_leg, truncated
 from needle_controller.planning.obstacles import Obstacles
 from needle_controller.planning.path_evaluation import (
+    PathEvaluation,
     PathProblem,
     PathSettings,
     PoseUncertainty,
@@ -47,19 +48,14 @@ class NeedlePath:
         Insertion at the beginning of the path [m].
     curvature : float
         Largest curvature of the path [1/m].
-    length, margin, near_margin, gentle_miss, violation, cost : float
-        See `PathEvaluation` [m]. A path with a violation is only followed if there is no other.
+    evaluation : PathEvaluation
+        Its evaluation. A path with a violation is only followed if there is no other.
     """
 
     legs: Array
     insertion: float
     curvature: float
-    length: float
-    margin: float
-    near_margin: float
-    gentle_miss: float
-    violation: float
-    cost: float
+    evaluation: PathEvaluation
 
     @property
     def aim(self) -> Array:
@@ -162,7 +158,7 @@ class PathPlanner:
         """
         problem = self._problem(tip, target, obstacles, insertion)
         path = self._best(problem, insertion, previous, starts)
-        if path is not None and path.violation <= 0.0:
+        if path is not None and path.evaluation.violation <= 0.0:
             return path
         if previous is None:
             return None
@@ -183,16 +179,18 @@ class PathPlanner:
         for number in range(starts):
             if self._is_satisfactory(best) or self._is_satisfactory(kept):
                 break
-            if best.violation <= 0.0 and number >= QUICK_STARTS:
+            if best.evaluation.violation <= 0.0 and number >= QUICK_STARTS:
                 break
             legs, draws = initial_legs(problem.start[:, 3], problem.target, number)
             evaluation = optimize_legs(legs, problem, draws)
-            path = NeedlePath(legs, insertion, problem.curvature, *evaluation)
-            if path.cost < best.cost:
-                best = path
+            if evaluation.cost < best.evaluation.cost:
+                best = NeedlePath(legs, insertion, problem.curvature, evaluation)
         bonus = 0.0 if previous is None else _BETTER_BY
-        clear = [path for path in (kept, best) if path.near_margin >= self._least_near_margin]
-        return min(clear, key=lambda path: path.cost - bonus * (path is kept), default=None)
+        least = self._least_near_margin
+        clear = [path for path in (kept, best) if path.evaluation.near_margin >= least]
+        return min(
+            clear, key=lambda path: path.evaluation.cost - bonus * (path is kept), default=None
+        )
 
     def trace(self, path: NeedlePath, tip: TipState) -> Array:
         """Return the corners of a polyline along a path from a tip, shape (N, 3) [m]."""
@@ -238,8 +236,9 @@ class PathPlanner:
 
     def _is_satisfactory(self, path: NeedlePath) -> bool:
         """Return whether only a shorter path would be better."""
-        return path.margin >= self.settings.preferred_margin and path.gentle_miss <= 0.0
+        found = path.evaluation
+        return found.margin >= self.settings.preferred_margin and found.gentle_miss <= 0.0
 
 
 def _evaluated(legs: Array, problem: PathProblem, insertion: float) -> NeedlePath:
-    return NeedlePath(legs, insertion, problem.curvature, *evaluate_path(legs, problem, 0.0))
+    return NeedlePath(legs, insertion, problem.curvature, evaluate_path(legs, problem, 0.0))

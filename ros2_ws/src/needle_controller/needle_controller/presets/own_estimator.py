@@ -59,33 +59,31 @@ class OwnEstimator:
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start over at a first measurement; see `Estimator.reset`."""
-        with self._part.errors_in("reset"):
-            self._own.reset(np.array(tip, dtype=float), np.array(joints, dtype=float))
+        start = np.array(tip, dtype=float), np.array(joints, dtype=float)
+        self._part.call("reset", self._own.reset, *start)
 
     def advance(self, d_insertion: float, d_rotation: float) -> None:
         """Advance by the actual motion; see `Estimator.advance`."""
-        with self._part.errors_in("advance"):
-            self._own.advance(float(d_insertion), float(d_rotation))
+        self._part.call("advance", self._own.advance, float(d_insertion), float(d_rotation))
 
     def correct(
         self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
     ) -> None:
         """Correct by a measured tip; see `Estimator.correct`."""
         matrix = None if covariance is None else np.array(covariance, dtype=float)
-        with self._part.errors_in("correct"):
-            self._own.correct(np.array(tip, dtype=float), matrix, float(age))
+        position = np.array(tip, dtype=float)
+        self._part.call("correct", self._own.correct, position, matrix, float(age))
 
     def correct_heading(self, direction: npt.ArrayLike, variance: float) -> None:
         """Pass a heading measured with the tip of the next `correct`, if the estimator uses it."""
         if method := getattr(self._own, "correct_heading", None):
-            with self._part.errors_in("correct_heading"):
-                method(np.array(direction, dtype=float), float(variance))
+            heading = np.array(direction, dtype=float)
+            self._part.call("correct_heading", method, heading, float(variance))
 
     def estimate(self) -> Estimate:
         """Return the present estimate; see `Estimator.estimate`."""
         part = self._part
-        with part.errors_in("estimate"):
-            estimate = self._own.estimate()
+        estimate = part.call("estimate", self._own.estimate)
         if not isinstance(estimate, Estimate):
             raise part.error(
                 f"estimate() returned {type(estimate).__name__}, expected an Estimate "
@@ -99,8 +97,8 @@ class OwnEstimator:
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
         """Transform everything into another target plane; see `Estimator.change_frame`."""
-        with self._part.errors_in("change_frame"):
-            self._own.change_frame(np.array(T_new_old, dtype=float))
+        transform = np.array(T_new_old, dtype=float)
+        self._part.call("change_frame", self._own.change_frame, transform)
 
 
 @cache

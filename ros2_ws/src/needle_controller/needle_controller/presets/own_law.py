@@ -40,8 +40,7 @@ class OwnLaw:
 
     def __call__(self, estimate: Estimate, insertion: float) -> SteeringCommand:
         """Return the command for the next step to the plane."""
-        with self._part.errors_in("to_plane"):
-            rate = self._law.to_plane(estimate, insertion)
+        rate = self._part.call("to_plane", self._law.to_plane, estimate, insertion)
         return self._command("to_plane()", rate, estimate)
 
     def to_point(
@@ -49,8 +48,7 @@ class OwnLaw:
     ) -> SteeringCommand:
         """Return the command for the next step to a point; see `PointLaw`."""
         goal = np.array(target, dtype=float)
-        with self._part.errors_in("to_point"):
-            rate = self._law.to_point(estimate, goal.copy())
+        rate = self._part.call("to_point", self._law.to_point, estimate, goal.copy())
         return self._command("to_point()", rate, estimate, _arc_left(estimate, goal))
 
     def _command(

@@ -14,8 +14,7 @@ import inspect
 import math
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, cast
@@ -78,20 +77,26 @@ class OwnPart:
 
     def make(self, *arguments: Any) -> Any:
         """Return an instance."""
-        with self.errors_in(f"{self.cls.__name__}{_CONSTRUCTORS[self.kind]}"):
-            return self.cls(*arguments)
+        return self.call(f"{self.cls.__name__}{_CONSTRUCTORS[self.kind]}", self.cls, *arguments)
 
     def error(self, text: str) -> OwnPartError:
         """Return an error that names the part and its origin."""
         return OwnPartError(f"{self.kind} {self.name!r} ({self.origin}): {text} ({_PAGE})")
 
-    @contextmanager
-    def errors_in(self, call: str) -> Iterator[None]:
-        """Convert exceptions of the package in a call into `OwnPartError`."""
+    def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function of the package; its exceptions become an `OwnPartError`.
+
+        Parameters
+        ----------
+        what : str
+            Name of a method, or description of the call.
+        function : callable
+            The function.
+        *arguments : object
+            Its arguments.
+        """
         try:
-            yield
-        except OwnPartError:
-            raise
+            return function(*arguments)
         except Exception as error:
             frames = traceback.extract_tb(error.__traceback__)
             # The deepest line of the author's own code is more useful than one of a library.
@@ -99,8 +104,8 @@ class OwnPart:
             frame = [one for one in frames if one.filename == file][-1:] or frames[-1:]
             where = f"{Path(frame[0].filename).name}:{frame[0].lineno}"
             words = " ".join(f"{type(error).__name__}: {error}".split())
-            arguments = _METHODS[self.kind].get(call, "")
-            raise self.error(f"{call}{arguments} raised {words} at {where}") from error
+            described = _METHODS[self.kind].get(what, "")
+            raise self.error(f"{what}{described} raised {words} at {where}") from error
 
     def checked(self, what: str, values: Any, shape: tuple[int, ...], meaning: str) -> Array:
         """Return a result of the part as an array.
@@ -177,8 +182,7 @@ def own_part(kind: str, name: str) -> OwnPart:
     entry = check_registered(kind, name)
     origin = f"{_package(entry)}, {entry.value}"
     part = OwnPart(kind, name, origin, object)
-    with part.errors_in("loading it"):
-        loaded = entry.load()
+    loaded = part.call("loading it", entry.load)
     if not inspect.isclass(loaded):
         raise part.error(
             f"{entry.value} is a {type(loaded).__name__}, expected a class that is made with "

@@ -68,8 +68,8 @@ class OwnPlanner:
             An exception of the planner, or points that are invalid or do not end at the target.
         """
         part = self.part
-        with part.errors_in("via_points"):
-            result = self._planner.via_points(tip, target.copy(), obstacles.table.copy())
+        arguments = tip, target.copy(), obstacles.table.copy()
+        result = part.call("via_points", self._planner.via_points, *arguments)
         if result is None:
             return None
         count = len(result) if np.ndim(result) == 2 else 1
@@ -213,7 +213,7 @@ class PathSteering:
         )
         if path is None:
             return None
-        length = None if len(path.legs) == 1 else path.length
+        length = None if len(path.legs) == 1 else path.evaluation.length
         return Route(path.aim, length, self._planner.trace(path, tip))
 
 

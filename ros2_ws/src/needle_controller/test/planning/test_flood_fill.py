@@ -121,4 +121,4 @@ def test_the_thorough_search_finds_more_than_the_quick_one() -> None:
     assert PLANNER.path(ENTRY, target, obstacles) is None
     found = first_path(PLANNER, ENTRY, target, obstacles)
     assert isinstance(found, NeedlePath)
-    assert found.margin >= 0.0
+    assert found.evaluation.margin >= 0.0

@@ -97,12 +97,12 @@ def test_a_simulated_path_is_clear_and_ends_within_the_tolerance() -> None:
         paths += len(path.legs) > 1
         places = driven(tip, path, 0.9 * CURVATURE)
         length = float(np.sum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
-        assert path.length == pytest.approx(length, rel=1e-3)
+        assert path.evaluation.length == pytest.approx(length, rel=1e-3)
         assert np.linalg.norm(places[-1] - target) <= settings.goal_tolerance + 1e-4
         # Chords of 5 mm are up to 0.03 mm off their arcs.
         clear = sampled_clearance(places, obstacles) - settings.least_clearance
         assert clear >= -3e-5
-        assert path.margin == pytest.approx(clear, abs=6e-5)
+        assert path.evaluation.margin == pytest.approx(clear, abs=6e-5)
     assert paths > 5
 
 
@@ -123,8 +123,8 @@ def test_without_obstacles_the_path_is_one_leg_to_the_target() -> None:
     path = found(planner().path(ENTRY, TARGET, Obstacles()))
     assert path.legs.shape == (1, 4)
     np.testing.assert_allclose(path.aim, TARGET)
-    assert path.margin == math.inf
-    assert path.length == pytest.approx(np.linalg.norm(TARGET), rel=0.01)
+    assert path.evaluation.margin == math.inf
+    assert path.evaluation.length == pytest.approx(np.linalg.norm(TARGET), rel=0.01)
 
 
 def test_a_needle_with_known_pose_passes_an_obstacle() -> None:
@@ -169,7 +169,7 @@ def test_uncertainty_increases_the_required_clearance() -> None:
     known = found(planner().path(ENTRY, straight, near))
     unsure = TipState(np.zeros(3), np.eye(3), CURVATURE, 0.0003, math.radians(3.0))
     doubted = planner().path(unsure, straight, near)
-    assert (-1.0 if doubted is None else doubted.margin) < known.margin
+    assert (-1.0 if doubted is None else doubted.evaluation.margin) < known.evaluation.margin
 
 
 def test_the_previous_path_continues_unless_it_is_blocked() -> None:
@@ -187,7 +187,7 @@ def test_the_previous_path_continues_unless_it_is_blocked() -> None:
     np.testing.assert_allclose(again.legs[-1, :3], moved)
     direct = found(plans.path(ENTRY, TARGET, Obstacles()))
     around = found(plans.path(ENTRY, TARGET, IN_THE_WAY, previous=direct))
-    assert around.margin >= 0.0
+    assert around.evaluation.margin >= 0.0
     assert len(around.legs) > 1
     assert plans.path(ENTRY, TARGET, BURIED, previous=direct) is None
 
