@@ -17,6 +17,7 @@ from scipy.stats import norm
 from needle_controller.filter.records import TORSION
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.laws.roll_law import RollLawSettings, roll_turn
+from needle_controller.observers.luenberger import INITIAL_ROLL_STD
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
@@ -60,7 +61,7 @@ class EkfNeedles:
         known = SteeringSettings(step_length=step_length, flip_depths=flip_depths, depth=1.0)
         self._law = RollLawSettings(**known.turning)
         self._plan = FlipPlan(flip_depths)
-        angles = (known.entry_angle_std, known.entry_angle_std, known.initial_roll_std)
+        angles = (known.entry_angle_std, known.entry_angle_std, INITIAL_ROLL_STD)
         spread = [tip_std] * 3 + [*angles, CURVATURE_SPREAD * known.curvature]
         self._prior = np.diag(np.square(spread))
         self._curvature, self._variance = known.curvature, tip_std**2

@@ -24,7 +24,7 @@ from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.observers.estimator import Estimate
 from needle_controller.observers.luenberger import (
     OBSERVER,
-    ObserverModel,
+    ObserverSettings,
     advance_observer,
     correct_observer,
 )
@@ -54,7 +54,7 @@ class ManyFilters:
     """
 
     def __init__(self, settings: FilterSettings, count: int, shortest_step: float) -> None:
-        self._prior = settings.prior()
+        self._settings, self._prior = settings, settings.prior()
         # An array: parallel loops cannot take a single record.
         self._assumed = np.array([settings.assumptions()])
         self._needles = np.zeros(count, NEEDLE)
@@ -83,8 +83,7 @@ class ManyFilters:
             self._events,
             self._prior,
             tips,
-            np.zeros((3, 3)) if covariance is None else covariance,
-            covariance is not None,
+            self._settings.tip_covariance(covariance),
             ages,
             self._assumed,
         )
@@ -118,8 +117,10 @@ class ManyFilters:
 class ManyObservers:
     """Observers of N needles, and the law of [KC09]."""
 
-    def __init__(self, model: ObserverModel, law: LinearizingGains | None, count: int) -> None:
-        self._model, self._law = model, law
+    def __init__(
+        self, settings: ObserverSettings, law: LinearizingGains | None, count: int
+    ) -> None:
+        self._settings, self._law = settings, law
         self._needles = np.zeros(count, OBSERVER)
 
     def start(self, tips: Array) -> Array:
@@ -139,21 +140,21 @@ class ManyObservers:
         tips, ages : ndarray, shape (N, 3), (N,)
             See `ManyFilters.correct`.
         """
-        _step_observers(self._needles, lengths, unturned, turns, tips, ages, self._model)
+        _step_observers(self._needles, lengths, unturned, turns, tips, ages, self._settings)
         return self._rates()
 
     def _rates(self) -> Array:
         rates = np.zeros(self._needles.size)
         if self._law is not None:
-            _linearizing_all(self._needles, self._model, self._law, rates)
+            _linearizing_all(self._needles, self._settings, self._law, rates)
         return rates
 
 
-@parallel
+@compiled
 def _start_all(
     needles: Records, hypotheses: Records, prior: Records, tips: Array, assumed: Records
 ) -> None:
-    for n in prange(needles.size):
+    for n in range(needles.size):
         start_needle(needles[n], hypotheses[n], prior, tips[n], 0.0, 0.0, assumed[0])
 
 
@@ -178,22 +179,12 @@ def _correct_all(
     prior: Records,
     tips: Array,
     covariance: Array,
-    has_covariance: bool,
     ages: Array,
     assumed: Records,
 ) -> None:
     for n in prange(needles.size):
-        correct_needle(
-            needles[n],
-            hypotheses[n],
-            events[n],
-            prior,
-            tips[n],
-            covariance,
-            has_covariance,
-            ages[n],
-            assumed[0],
-        )
+        needle, own = needles[n], hypotheses[n]
+        correct_needle(needle, own, events[n], prior, tips[n], covariance, ages[n], assumed[0])
 
 
 @parallel
@@ -250,29 +241,29 @@ def _step_observers(
     turns: Array,
     tips: Array,
     ages: Array,
-    model: ObserverModel,
+    settings: ObserverSettings,
 ) -> None:
     # Most steps have the same length, and so the same gain.
     since, gain = 0.0, (0.0, 0.0, 0.0)
     for n in range(needles.size):
         needle = needles[n]
         if unturned[n] > 0.0:
-            advance_observer(needle, unturned[n], 0.0, model)
-        advance_observer(needle, lengths[n] - unturned[n], turns[n], model)
+            advance_observer(needle, unturned[n], 0.0, settings)
+        advance_observer(needle, lengths[n] - unturned[n], turns[n], settings)
         if math.isfinite(tips[n, 0] + tips[n, 1] + tips[n, 2]):
             if needle.since_correction != since:
                 since = needle.since_correction
-                gain = sampled_observer_gain(model.poles, since)
-            correct_observer(needle, tips[n, 0], ages[n], gain, model)
+                gain = sampled_observer_gain(settings.poles, since)
+            correct_observer(needle, tips[n, 0], ages[n], gain, settings)
 
 
 @compiled
 def _linearizing_all(
-    needles: Records, model: ObserverModel, law: LinearizingGains, rates: Array
+    needles: Records, settings: ObserverSettings, law: LinearizingGains, rates: Array
 ) -> None:
     for n in range(needles.size):
         s = needles[n].linearized
         # Roll of s, the inverse of (6)
-        sine = s[2] / model.curvature
+        sine = s[2] / settings.curvature
         roll = math.atan2(sine, math.sqrt(1.0 - s[1] * s[1] - sine * sine))
-        rates[n] = linearizing_rate(s, roll, model.curvature, law)[1]
+        rates[n] = linearizing_rate(s, roll, settings.curvature, law)[1]

@@ -188,7 +188,7 @@ class PaperNeedles:
         gains = self._settings.gains()
         law = make_law(self._settings, gains)
         self._needles = ManyObservers(
-            observer_settings(self._settings, gains).model,
+            observer_settings(self._settings, gains),
             law.gains if isinstance(law, LinearizingLaw) else None,
             len(tips),
         )

@@ -219,7 +219,6 @@ def correct_needle(
     prior: Records,
     tip: Array,
     covariance: Array,
-    has_covariance: bool,
     age: float,
     assumed: Any,
 ) -> None:
@@ -237,13 +236,12 @@ def correct_needle(
     tip : ndarray, shape (3,)
         The tip [m]; NaN if it was not found.
     covariance : ndarray, shape (3, 3)
-        Covariance of the tip [m^2] if `has_covariance`; otherwise the noise has the assumed bound.
+        Covariance of the tip, see `FilterSettings.tip_covariance` [m^2].
     age : float
         Stated insertion since the exposure of the tip [m].
     """
     reading = new_reading()
-    _set_reading(reading, tip, covariance, has_covariance, assumed)
-    reading.heading[:] = needle.heading
+    _set_reading(reading, tip, covariance, needle.heading)
     needle.heading[3] = 0.0
     _apply_tip(needle, hypotheses, reading, age + needle.late, assumed)
     if needle.events < 0:
@@ -253,7 +251,7 @@ def correct_needle(
         if needle.events < 0:
             return
     event = events[needle.events - 1]
-    event.is_tip, event.has_covariance, event.age = True, has_covariance, age
+    event.is_tip, event.age = True, age
     for i in range(3):
         event.tip[i] = tip[i]
         for j in range(3):
@@ -270,8 +268,7 @@ def correct_needle(
             event = events[k]
             _queue(needle, hypotheses, event.length, event.turn, assumed)
             if event.is_tip:
-                _set_reading(reading, event.tip, event.covariance, event.has_covariance, assumed)
-                reading.heading[:] = event.heading
+                _set_reading(reading, event.tip, event.covariance, event.heading)
                 _apply_tip(needle, hypotheses, reading, event.age + needle.late, assumed)
 
 
@@ -296,17 +293,13 @@ def _estimated_age(needle: Any, events: Records, assumed: Any) -> float:
 
 
 @compiled
-def _set_reading(
-    reading: Reading, tip: Array, covariance: Array, has_covariance: bool, assumed: Any
-) -> None:
-    """Set a tip and its covariance, which includes the error of the model."""
+def _set_reading(reading: Reading, tip: Array, covariance: Array, heading: Array) -> None:
+    """Set a tip, its covariance and the heading measured with it."""
     for i in range(3):
         reading.tip[i] = tip[i]
         for j in range(3):
-            reading.covariance[i, j] = covariance[i, j] if has_covariance else 0.0
-        reading.covariance[i, i] += (
-            assumed.model_error if has_covariance else assumed.effective_bound**2 / 3.0
-        )
+            reading.covariance[i, j] = covariance[i, j]
+    reading.heading[:] = heading
 
 
 @compiled

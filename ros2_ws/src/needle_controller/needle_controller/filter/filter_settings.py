@@ -213,6 +213,15 @@ class FilterSettings:
         """Assumed largest error of a measured coordinate [m]."""
         return max(self.tip_noise_bound, 2.0 * self.model_error)
 
+    def tip_covariance(self, measured: npt.ArrayLike | None) -> Array:
+        """Return the covariance of a tip, (3, 3) [m^2]: the measured one with the model's error.
+
+        Without one, it is that of the assumed bound.
+        """
+        if measured is None:
+            return np.asarray(np.eye(3) * (self.effective_bound * self.effective_bound / 3.0))
+        return np.asarray(measured, dtype=float) + np.eye(3) * self.model_error**2
+
     def assumptions(self) -> np.void:
         """Return the settings for compiled code."""
         assumed = np.zeros(1, ASSUMPTIONS)[0]

@@ -104,8 +104,7 @@ class HypothesisFilter:
             self._events,
             self._prior,
             np.array(tip, dtype=float),
-            np.zeros((3, 3)) if covariance is None else np.array(covariance, dtype=float),
-            covariance is not None,
+            self.settings.tip_covariance(covariance),
             float(age),
             self._assumed,
         )

@@ -12,8 +12,8 @@ ERROR = 9
 """Length of a hypothesis's error: position [m], rotation vector [rad] (the true orientation is
 exp(error) R, its axes those of `target_plane`), curvature [1/m], torsion parameter [rad] or [m],
 insertion scale [-]."""
-E_POSITION, E_TURN, E_KAPPA, E_TORSION, E_SCALE = 0, 3, 6, 7, 8
-"""Index of each part in the error."""
+E_TURN, E_KAPPA, E_TORSION, E_SCALE = 3, 6, 7, 8
+"""Index of each part in the error; the position comes first."""
 NOISES = 6
 """Largest number of noise models of one shape."""
 LONGEST_QUEUE = 64
@@ -77,7 +77,6 @@ EVENT = np.dtype(
         ("turn", np.float64),  # of the base [rad]
         ("is_tip", np.bool_),
         ("tip", np.float64, 3),  # [m]; NaN if it was not found
-        ("has_covariance", np.bool_),
         ("covariance", np.float64, (3, 3)),  # [m^2]
         ("age", np.float64),  # [m]
         ("heading", np.float64, 4),  # as in NEEDLE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -22,6 +21,9 @@ from needle_controller.model.kinematics import YAW, angles_from_rotation, rotati
 from needle_controller.observers.estimator import Estimate
 from needle_core.compiled import compiled
 
+INITIAL_YAW_STD = INITIAL_PITCH_STD = math.radians(10.0)
+INITIAL_ROLL_STD = math.radians(30.0)
+"""Standard deviations of the orientation at the entry, for the covariance only [rad]."""
 OBSERVER = np.dtype(
     [
         ("linearized", np.float64, 3),  # s of (6)
@@ -33,47 +35,28 @@ OBSERVER = np.dtype(
 """State of the observer for one needle."""
 
 
-class ObserverModel(NamedTuple):
-    """Assumptions about a needle; see `LuenbergerSettings`."""
-
-    curvature: float
-    margin: float
-    poles: npt.NDArray[np.complex128]
-
-
-@dataclasses.dataclass(frozen=True)
-class LuenbergerSettings:
+class ObserverSettings(NamedTuple):
     """Assumptions of the observer.
 
     Attributes
     ----------
     curvature : float
         Curvature of the needle's path, kappa [1/m].
-    observer_poles : ndarray of complex, shape (3,)
+    saturation_margin : float
+        Distance of the estimate from the border of the region of (6), in [0, 1).
+    poles : ndarray of complex, shape (3,)
         Eigenvalues of A - L C [1/m], from `gains.design_gains`.
     process_noise : ndarray, shape (3, 3)
         Covariance of white noise on ds/dl per metre; for the covariance only.
     measurement_std : float
         Standard deviation of one measured coordinate [m]; for the covariance only.
-    saturation_margin : float
-        Distance of the estimate from the border of the region of (6), in [0, 1).
-    initial_yaw_std, initial_pitch_std, initial_roll_std : float
-        Standard deviations of the orientation at the entry [rad]; for the covariance only.
     """
 
     curvature: float
-    observer_poles: npt.NDArray[np.complex128]
+    saturation_margin: float
+    poles: npt.NDArray[np.complex128]
     process_noise: Array
     measurement_std: float
-    saturation_margin: float
-    initial_yaw_std: float
-    initial_pitch_std: float
-    initial_roll_std: float
-
-    @property
-    def model(self) -> ObserverModel:
-        """The settings for compiled code."""
-        return ObserverModel(self.curvature, self.saturation_margin, self.observer_poles)
 
 
 class LuenbergerObserver:
@@ -85,7 +68,7 @@ class LuenbergerObserver:
 
     Parameters
     ----------
-    settings : LuenbergerSettings
+    settings : ObserverSettings
         Gains and assumptions.
     initial_rotation : array_like, shape (3, 3), optional
         Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`;
@@ -93,9 +76,9 @@ class LuenbergerObserver:
     """
 
     def __init__(
-        self, settings: LuenbergerSettings, initial_rotation: npt.ArrayLike | None = None
+        self, settings: ObserverSettings, initial_rotation: npt.ArrayLike | None = None
     ) -> None:
-        self._settings, self._model = settings, settings.model
+        self._settings = settings
         self.initial_rotation: Array = (
             np.eye(3) if initial_rotation is None else np.asarray(initial_rotation, dtype=float)
         )
@@ -115,8 +98,8 @@ class LuenbergerObserver:
         self._tip_covariance = np.eye(3) * settings.measurement_std**2
         stds = (
             settings.measurement_std,
-            settings.initial_pitch_std,
-            settings.curvature * settings.initial_roll_std,
+            INITIAL_PITCH_STD,
+            settings.curvature * INITIAL_ROLL_STD,
         )
         self._covariance = np.diag(np.square(stds))
 
@@ -125,7 +108,7 @@ class LuenbergerObserver:
         length = float(d_insertion)
         if not (math.isfinite(length) and length >= 0.0):
             raise ValueError(f"d_insertion = {length!r} m, expected finite and >= 0")
-        advance_observer(self._needle, length, float(d_rotation), self._model)
+        advance_observer(self._needle, length, float(d_rotation), self._settings)
         self._inserted += length
         # P <- F P F^T + Q
         f = transition(length)
@@ -149,8 +132,8 @@ class LuenbergerObserver:
         if not found:
             return
         since = float(self._needle["since_correction"])
-        of_each = sampled_observer_gain(self._model.poles, since)
-        correct_observer(self._needle, float(measured_tip[0]), float(age), of_each, self._model)
+        of_each = sampled_observer_gain(self._settings.poles, since)
+        correct_observer(self._needle, float(measured_tip[0]), float(age), of_each, self._settings)
         gain = np.array(of_each)
         self._tip = measured_tip
         if covariance is not None:
@@ -193,7 +176,7 @@ class LuenbergerObserver:
             np.array([x, pitch, roll]), self._settings.curvature
         )
         self._needle["yaw"] = yaw
-        saturate(self._needle, self._model)
+        saturate(self._needle, self._settings)
 
     def _coordinate_covariance(self, reduced: Array) -> Array:
         """Return the covariance of q, to first order."""
@@ -205,7 +188,7 @@ class LuenbergerObserver:
         )
         covariance[1:3, 1:3] = self._tip_covariance[1:3, 1:3]
         # The yaw is not observed: its initial variance, and all the yaw that wrong rolls can cause.
-        covariance[YAW, YAW] = self._settings.initial_yaw_std**2 + (curvature * self._inserted) ** 2
+        covariance[YAW, YAW] = INITIAL_YAW_STD**2 + (curvature * self._inserted) ** 2
         return covariance
 
 
@@ -219,7 +202,7 @@ def saturation_factor(s2: float, sine: float, margin: float) -> float:
 
 
 @compiled
-def saturate(needle: Any, model: ObserverModel) -> None:
+def saturate(needle: Any, settings: ObserverSettings) -> None:
     """Project s radially onto s2^2 + (s3 / kappa)^2 <= 1 - margin ([KC09] IV-A).
 
     In this region s has a pitch and a roll within +-90 deg; s1 is free. In the coordinates (s2, s3
@@ -228,14 +211,14 @@ def saturate(needle: Any, model: ObserverModel) -> None:
     sqrt(margin).
     """
     s = needle.linearized
-    scale = saturation_factor(s[1], s[2] / model.curvature, model.margin)
+    scale = saturation_factor(s[1], s[2] / settings.curvature, settings.saturation_margin)
     needle.saturated = scale < 1.0
     s[1] *= scale
     s[2] *= scale
 
 
 @compiled
-def advance_observer(needle: Any, length: float, turn: float, model: ObserverModel) -> None:
+def advance_observer(needle: Any, length: float, turn: float, settings: ObserverSettings) -> None:
     """Advance the linearized state by the actual motion: A s + B v of (9).
 
     v is constant over the length, with the value that leads to the same roll as (5) with u: (7) for
@@ -247,10 +230,10 @@ def advance_observer(needle: Any, length: float, turn: float, model: ObserverMod
         The needle.
     length, turn : float
         Inserted length [m] and rotation of the base [rad].
-    model : ObserverModel
+    settings : ObserverSettings
         Assumptions.
     """
-    s, kappa = needle.linearized, model.curvature
+    s, kappa = needle.linearized, settings.curvature
     s2, s3 = s[1], s[2]
     # In the region of (6), cos(pitch) and cos(roll) are positive square roots.
     cos_pitch = math.sqrt(1.0 - s2 * s2)
@@ -270,7 +253,7 @@ def advance_observer(needle: Any, length: float, turn: float, model: ObserverMod
     s[0] += length * s2 + length * length * (0.5 * s3 + added / 6.0)
     s[1] = s2 + length * (s3 + 0.5 * added)
     s[2] = s3 + added
-    saturate(needle, model)
+    saturate(needle, settings)
     # dyaw = kappa cos(roll) / cos(pitch) l, (4), trapezoidal
     squared = 1.0 - s[1] * s[1]
     slope = cos_roll / cos_pitch + math.sqrt(squared - (s[2] / kappa) ** 2) / squared
@@ -280,7 +263,7 @@ def advance_observer(needle: Any, length: float, turn: float, model: ObserverMod
 
 @compiled
 def correct_observer(
-    needle: Any, x: float, age: float, gain: tuple[float, float, float], model: ObserverModel
+    needle: Any, x: float, age: float, gain: tuple[float, float, float], settings: ObserverSettings
 ) -> None:
     """Correct the linearized state by a measured distance from the plane: (9).
 
@@ -294,7 +277,7 @@ def correct_observer(
         Insertion since its exposure [m].
     gain : tuple of float
         L, from `sampled_observer_gain` over the insertion since the last correction.
-    model : ObserverModel
+    settings : ObserverSettings
         Assumptions.
     """
     s = needle.linearized
@@ -303,5 +286,5 @@ def correct_observer(
     s[0] += gain[0] * innovation
     s[1] += gain[1] * innovation
     s[2] += gain[2] * innovation
-    saturate(needle, model)
+    saturate(needle, settings)
     needle.since_correction = 0.0

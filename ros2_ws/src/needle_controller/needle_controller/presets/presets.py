@@ -12,7 +12,7 @@ from needle_controller.laws.law import LinearizingGains, LinearizingLaw, OpenLoo
 from needle_controller.laws.roll_law import RollLaw, RollLawSettings
 from needle_controller.model.gains import Gains
 from needle_controller.observers.estimator import Estimator
-from needle_controller.observers.luenberger import LuenbergerObserver, LuenbergerSettings
+from needle_controller.observers.luenberger import LuenbergerObserver, ObserverSettings
 from needle_controller.presets.own_estimator import OwnEstimator, checked_estimator
 from needle_controller.presets.own_law import OwnLaw, checked_law
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -42,17 +42,14 @@ def filter_settings(settings: SteeringSettings) -> FilterSettings:
     )
 
 
-def observer_settings(settings: SteeringSettings, gains: Gains) -> LuenbergerSettings:
+def observer_settings(settings: SteeringSettings, gains: Gains) -> ObserverSettings:
     """Return the observer settings of presets `paper` and `open_loop`."""
-    return LuenbergerSettings(
+    return ObserverSettings(
         curvature=settings.curvature,
-        observer_poles=gains.observer_poles,
+        saturation_margin=settings.saturation_margin,
+        poles=gains.observer_poles,
         process_noise=np.diag(settings.process_noise),
         measurement_std=settings.measurement_std,
-        saturation_margin=settings.saturation_margin,
-        initial_yaw_std=settings.initial_yaw_std,
-        initial_pitch_std=settings.initial_pitch_std,
-        initial_roll_std=settings.initial_roll_std,
     )
 
 

@@ -231,27 +231,6 @@ class SteeringSettings:
         1e-3,
         math.pi,
     )
-    initial_yaw_std: float = parameter(
-        math.radians(10.0),
-        "rad",
-        "Standard deviation of the yaw at the entry (only for the covariance).",
-        0.0,
-        math.pi,
-    )
-    initial_pitch_std: float = parameter(
-        math.radians(10.0),
-        "rad",
-        "Standard deviation of the pitch at the entry (only for the covariance).",
-        0.0,
-        math.pi,
-    )
-    initial_roll_std: float = parameter(
-        math.radians(30.0),
-        "rad",
-        "Standard deviation of the roll at the entry (only for the covariance).",
-        0.0,
-        math.pi,
-    )
 
     def __post_init__(self) -> None:
         """Check all settings, and the gains of presets that have any."""

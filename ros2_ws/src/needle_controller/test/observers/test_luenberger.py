@@ -13,9 +13,11 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.observers.luenberger import (
+    INITIAL_PITCH_STD,
+    INITIAL_ROLL_STD,
+    INITIAL_YAW_STD,
     OBSERVER,
     LuenbergerObserver,
-    ObserverModel,
     saturate,
 )
 from needle_controller.presets.presets import make_law, observer_settings
@@ -135,7 +137,7 @@ def test_many_needles_equal_single_ones() -> None:
     turns = rng.normal(0.0, 0.1, (20, count))
     tips[3, 2] = np.nan
     gains = SETTINGS.gains()
-    many = ManyObservers(observer_settings(SETTINGS, gains).model, law().gains, count)
+    many = ManyObservers(observer_settings(SETTINGS, gains), law().gains, count)
     every = [observer() for _ in range(count)]
     many.start(tips[0].copy())
     for n, one in enumerate(every):
@@ -151,7 +153,8 @@ def test_many_needles_equal_single_ones() -> None:
 def saturated(s: list[float], margin: float = 0.0) -> tuple[Array, bool]:
     needle = np.zeros(1, OBSERVER)[0]
     needle["linearized"] = s
-    saturate(needle, ObserverModel(CURVATURE, margin, np.zeros(3, dtype=complex)))
+    settings = observer_settings(SETTINGS, SETTINGS.gains())
+    saturate(needle, settings._replace(saturation_margin=margin))
     return needle["linearized"], bool(needle["saturated"])
 
 
@@ -200,8 +203,8 @@ def test_covariance_is_honest() -> None:
     rng, count = default_rng(9), 60
     squares = []
     for _ in range(count):
-        pitch = rng.normal(0.0, SETTINGS.initial_pitch_std / 2)
-        roll = rng.normal(0.0, SETTINGS.initial_roll_std / 2)
+        pitch = rng.normal(0.0, INITIAL_PITCH_STD / 2)
+        roll = rng.normal(0.0, INITIAL_ROLL_STD / 2)
         plant, one = plant_at(0.0, pitch, roll), observer()
         one.reset(plant.T_rig_tip[:3, 3] + rng.uniform(-1e-3, 1e-3, 3), np.zeros(2))
         for _ in range(20):
@@ -215,7 +218,7 @@ def test_covariance_is_honest() -> None:
     assert np.all(np.linalg.eigvalsh(known.covariance) > 0.0)
     # y and z are measured; the yaw is not observed.
     assert known.covariance[1, 1] == pytest.approx(SETTINGS.measurement_std**2)
-    assert known.covariance[3, 3] >= SETTINGS.initial_yaw_std**2
+    assert known.covariance[3, 3] >= INITIAL_YAW_STD**2
 
 
 def test_saturation_is_reported() -> None:
