@@ -41,6 +41,9 @@ _ITERATIONS = 30
 _ROBUST_ITERATIONS = 5
 _SMALLEST_NOISE = 1e-9
 _ARBITRARY_START = 1e-3
+_OUTLIER_LIMIT = 4.0
+"""Distance from the arc, in standard deviations of a coordinate, beyond which a tip loses weight
+with the 4th power of its distance."""
 # Median of a tip's squared distance in variances of a coordinate: about halfway between those for
 # normal and for uniform noise.
 _MEDIAN_SQUARED = {3: 2.6, 2: 1.5}
@@ -53,7 +56,7 @@ _HEADING_STD = math.radians(5.0)
 
 @dataclasses.dataclass(frozen=True)
 class CurvatureFitSettings:
-    """Priors and noise of a fit.
+    """Priors of a fit.
 
     Attributes
     ----------
@@ -65,11 +68,6 @@ class CurvatureFitSettings:
         The entry point [m].
     entry_std : float
         Its standard deviation along each axis [m]; infinite if it is unknown.
-    measurement_std : float, optional
-        Standard deviation of one measured coordinate [m]; estimated from the residuals by default.
-    outlier_limit : float
-        Distance from the arc, in standard deviations of a coordinate, beyond which a tip loses
-        weight with the 4th power of its distance; infinite for plain least squares.
     slip_std : float
         Standard deviation of the relative difference between the insertions of needle and stage.
     repeating_error : float
@@ -81,8 +79,6 @@ class CurvatureFitSettings:
     heading_std: float = _HEADING_STD
     entry: tuple[float, float, float] = (0.0, 0.0, 0.0)
     entry_std: float = 0.0005
-    measurement_std: float | None = None
-    outlier_limit: float = 4.0
     slip_std: float = 0.1
     repeating_error: float = 0.0
 
@@ -106,7 +102,7 @@ class CurvatureFit:
     std : ndarray, shape (...)
         Its standard deviation [1/m].
     measurement_std : ndarray, shape (...)
-        Standard deviation of one measured coordinate, assumed or from the residuals [m].
+        Standard deviation of one measured coordinate, from the residuals [m].
     weights : ndarray, shape (..., K)
         Weight of each tip, 1 for most tips and near 0 for an outlier.
     residuals : ndarray, shape (..., K, 3)
@@ -171,7 +167,7 @@ def fit_curvature(
         Insertion of the stage at each tip [m]. If it is None, each tip belongs to the nearest point
         of the arc, and only its distance across the arc counts.
     settings : CurvatureFitSettings, optional
-        Priors and noise.
+        Priors.
 
     Returns
     -------
@@ -199,7 +195,6 @@ def fit_curvature(
     _check_length(length)
     unknowns = np.zeros((*tips.shape[:-2], UNKNOWNS + 1))
     weights = np.ones(tips.shape[:-1])
-    sigma = np.full(tips.shape[:-2], settings.measurement_std or 1e-3)
     for iteration in range(_ITERATIONS):
         inserted = length * (1.0 + unknowns[..., _GAIN:])
         expected, slopes, tangent = arc_points(unknowns[..., :_GAIN], inserted)
@@ -211,11 +206,10 @@ def fit_curvature(
             across = np.sum(slopes * tangent[..., None], axis=-2, keepdims=True)
             slopes = slopes - tangent[..., None] * across
             length = length + along[..., 0]
-        if settings.measurement_std is None:
-            robust = iteration < _ROBUST_ITERATIONS
-            sigma = _noise(residual, weights, directions=3 if known else 2, robust=robust)
+        robust = iteration < _ROBUST_ITERATIONS
+        sigma = _noise(residual, weights, directions=3 if known else 2, robust=robust)
         squared = np.sum(residual**2, axis=-1) / sigma[..., None] ** 2
-        weights = np.minimum(1.0, (settings.outlier_limit**2 / np.maximum(squared, 1e-9)) ** 2)
+        weights = np.minimum(1.0, (_OUTLIER_LIMIT**2 / np.maximum(squared, 1e-9)) ** 2)
         scaled = weights[..., None, None] * slopes
         normal = np.einsum("...kij,...kil->...jl", scaled, slopes)
         gradient = np.einsum("...kij,...ki->...j", scaled, residual)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -45,12 +46,15 @@ def test_the_forecast_of_a_straight_needle_is_gaussian_process_regression(
     """Compare with the same model in the form of covariances between positions."""
     scale = 0.3
     monkeypatch.setattr(tip_forecast, "SCALES", np.array([scale]))
-    settings = CurvatureFitSettings(slip_std=1e-6, measurement_std=NOISE, outlier_limit=math.inf)
+    settings = CurvatureFitSettings(slip_std=1e-6)
     # The needle moves so little aside that the sine of its heading equals the heading.
     bends = np.random.default_rng(5).normal(0.0, 1e-6, (len(INSERTION), 2))
     seen = np.column_stack([np.cumsum(np.cumsum(bends, axis=0), axis=0), INSERTION])
     checked = fit_checked(seen, INSERTION, settings)
-    ahead = forecast_tip(seen, True, checked, AHEAD)
+    # Known noise, no outliers.
+    known_noise = {"measurement_std": np.array(NOISE), "weights": np.ones(len(INSERTION))}
+    fit = dataclasses.replace(checked.fit, **known_noise)
+    ahead = forecast_tip(seen, True, dataclasses.replace(checked, fit=fit), AHEAD)
     places = np.append(INSERTION, AHEAD)
     cells = np.arange(0.0005, AHEAD, 0.001)
     moved = np.maximum(places[:, None] - cells, 0.0) * 0.001
