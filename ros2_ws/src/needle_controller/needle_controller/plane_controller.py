@@ -49,13 +49,9 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
 PROPOSED_TARGET, PLANNED_PATH = "needle/proposed_target", "needle/planned_path"
-_CHECKED = ("joint_states", TARGET_PLANE, TARGET_POINT, OBSTACLES, PROPOSED_TARGET)
 _NO_DRIVERS = ("recorder", "peer_topics")
-_KEPT_MESSAGE = {
-    TARGET_PLANE: "keeping the last plane",
-    TARGET_POINT: "keeping the last target",
-    OBSTACLES: "keeping the last obstacles",
-}
+_TARGETS = (TARGET_PLANE, TARGET_POINT, OBSTACLES)
+_CHECKED = ("joint_states", *_TARGETS, PROPOSED_TARGET)
 _LOG_PERIOD = 2.0
 """Shortest time between two log messages of one kind [s]."""
 _UNKNOWN_HEADING = 0.25
@@ -88,7 +84,7 @@ class PlaneController(Component):
         self.problems: dict[str, str] = {}
         self._proposal: m.Point | None = None
         self._bad_joints = 0
-        self._missing: list[str] = [f"subscriber of {COMMANDS}"]
+        self._has_driver = False
         self._received = ReceptionLog()
         self._logged: dict[str, float] = {}
         self._reported_health: tuple[dict[str, str], dict[str, str]] | None = None
@@ -147,8 +143,7 @@ class PlaneController(Component):
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Check that a driver subscribes to commands: without one, the first step would be lost."""
         names = peers.subscribers.get(COMMANDS, ())
-        receivers = [name for name in names if name.rpartition("/")[2] not in _NO_DRIVERS]
-        self._missing = [] if receivers else [f"subscriber of {COMMANDS}"]
+        self._has_driver = any(name.rpartition("/")[2] not in _NO_DRIVERS for name in names)
         return ()
 
     def _receive(
@@ -169,8 +164,8 @@ class PlaneController(Component):
 
     def _on_bad_message(self, topic: str, error: UserError) -> list[Action]:
         self._bad_joints += topic == "joint_states"
-        kept = _KEPT_MESSAGE.get(topic)
-        self.problems[topic] = f"{error}; {kept}" if kept else str(error)
+        kept = "; the last valid one stays" if topic in _TARGETS else ""
+        self.problems[topic] = f"{error}{kept}"
         return [Log("warning", self.problems[topic], topic)]
 
     def _on_joints(self, message: m.JointState, at: Moment) -> Iterable[Action]:
@@ -236,8 +231,8 @@ class PlaneController(Component):
         return reply, self.carry_out(actions, at)
 
     def _on_start(self, _: bool | None, number: int, at: Moment) -> Actions:
-        if self._missing:
-            yield Reply(number, False, f"waiting for {', '.join(self._missing)}")
+        if not self._has_driver:
+            yield Reply(number, False, f"waiting for subscriber of {COMMANDS}")
             return
         reply, actions = self.start(at)
         yield from actions
@@ -293,14 +288,8 @@ class PlaneController(Component):
 
 def trajectory(command: SendStep | SendPath) -> m.Trajectory:
     """Return the trajectory of a step (one point) or a path (several)."""
-    match command:
-        case SendStep(stamp_ns, insertion, rotation, duration):
-            points: tuple[m.TrajectoryPoint, ...] = (
-                m.TrajectoryPoint((insertion, rotation), duration),
-            )
-        case SendPath(stamp_ns, corners):
-            points = tuple(m.TrajectoryPoint((at, turn), time) for at, turn, time in corners)
-    return m.Trajectory(stamp_ns, (m.INSERTION_JOINT, m.ROTATION_JOINT), points)
+    points = tuple(m.TrajectoryPoint((at, turn), time) for at, turn, time in command.points)
+    return m.Trajectory(command.stamp_ns, (m.INSERTION_JOINT, m.ROTATION_JOINT), points)
 
 
 def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:

@@ -239,7 +239,7 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
     for bad, cause in (((np.nan, 0.0, 0.0), "not finite"), ((0.5, 0.0, 0.0), "cannot be reached")):
         bench.receive("target_plane", dataclasses.replace(plane, position=bad))
         assert cause in bench.health["target_plane"].message
-    assert "keeping the last plane" in bench.component.problems["target_plane"]
+    assert "the last valid one stays" in bench.component.problems["target_plane"]
     assert bench.status.target_offset_m == 0.005
     for x, z in ((0.01, 0.1), (0.09, 0.1)):
         bench.receive("target_point", m.Point(0, "rig", (x, 0.0, z)))
@@ -252,7 +252,7 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
     ball = m.Marker("rig", "bone", 1, 2, 0, (0.0, 0.0, 0.06), STRAIGHT, (0.004, 0.004, 0.004))
     bench.receive("obstacles", m.Markers((ball,)))
     bench.receive("obstacles", m.Markers((dataclasses.replace(ball, kind=1),)))
-    assert "keeping the last obstacles" in bench.health["obstacles"].message
+    assert "the last valid one stays" in bench.health["obstacles"].message
     assert bench.status.obstacles == 1
     bench.receive("obstacles", m.Markers(()))
     assert bench.status.obstacles == 0

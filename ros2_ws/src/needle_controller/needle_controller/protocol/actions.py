@@ -59,6 +59,11 @@ class SendStep:
     rotation: float
     duration: float
 
+    @property
+    def points(self) -> tuple[tuple[float, float, float], ...]:
+        """The step as `SendPath.points`."""
+        return ((self.insertion, self.rotation, self.duration),)
+
 
 @dataclasses.dataclass(frozen=True)
 class SendPath:
