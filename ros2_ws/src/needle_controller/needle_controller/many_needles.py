@@ -102,7 +102,9 @@ class ManyFilters:
     def roll_rates(self, settings: RollLawSettings, bend_sign: float) -> Array:
         """Return each base's rotation rate by the roll law, (N,) [rad/m]."""
         turns = np.empty(self.estimates.size)
-        _roll_all(self.estimates, self.torsions, bend_sign, settings, turns)
+        # Contiguous, as in the node: compiled once.
+        uncertainty = np.ascontiguousarray(self.estimates["uncertainty"])
+        _roll_all(self.estimates, uncertainty, self.torsions, bend_sign, settings, turns)
         return turns / settings.step_length
 
     def point_rates(
@@ -146,7 +148,8 @@ class ManyObservers:
     def _rates(self) -> Array:
         rates = np.zeros(self._needles.size)
         if self._law is not None:
-            _linearizing_all(self._needles, self._settings, self._law, rates)
+            linearized = np.ascontiguousarray(self._needles["linearized"])
+            _linearizing_all(linearized, self._settings.curvature, self._law, rates)
         return rates
 
 
@@ -197,14 +200,17 @@ def _estimate_all(
 
 @compiled
 def _roll_all(
-    estimates: Records, torsions: Records, bend_sign: float, settings: RollLawSettings, turns: Array
+    estimates: Records,
+    uncertainty: Array,
+    torsions: Records,
+    bend_sign: float,
+    settings: RollLawSettings,
+    turns: Array,
 ) -> None:
     for n in range(estimates.size):
-        estimate = estimates[n]
-        s, uncertainty = estimate.linearized, estimate.uncertainty
-        base, wound = estimate.base, estimate.wound
+        s, base, wound = estimates[n].linearized, estimates[n].base, estimates[n].wound
         turns[n] = roll_turn(
-            s[0], s[1], uncertainty, torsions[n], base, wound, bend_sign, settings
+            s[0], s[1], uncertainty[n], torsions[n], base, wound, bend_sign, settings
         )[0]
 
 
@@ -259,11 +265,11 @@ def _step_observers(
 
 @compiled
 def _linearizing_all(
-    needles: Records, settings: ObserverSettings, law: LinearizingGains, rates: Array
+    linearized: Array, curvature: float, law: LinearizingGains, rates: Array
 ) -> None:
-    for n in range(needles.size):
-        s = needles[n].linearized
+    for n in range(rates.size):
+        s = linearized[n]
         # Roll of s, the inverse of (6)
-        sine = s[2] / settings.curvature
+        sine = s[2] / curvature
         roll = math.atan2(sine, math.sqrt(1.0 - s[1] * s[1] - sine * sine))
-        rates[n] = linearizing_rate(s, roll, settings.curvature, law)[1]
+        rates[n] = linearizing_rate(s, roll, curvature, law)[1]

@@ -256,7 +256,8 @@ def correct_needle(
         event.tip[i] = tip[i]
         for j in range(3):
             event.covariance[i, j] = covariance[i, j]
-    event.heading[:] = reading.heading
+    for i in range(4):
+        event.heading[i] = reading.heading[i]
     if needle.inserted < LAST:
         return
     count, needle.events = needle.events, -1
@@ -299,7 +300,8 @@ def _set_reading(reading: Reading, tip: Array, covariance: Array, heading: Array
         reading.tip[i] = tip[i]
         for j in range(3):
             reading.covariance[i, j] = covariance[i, j]
-    reading.heading[:] = heading
+    for i in range(4):
+        reading.heading[i] = heading[i]
 
 
 @compiled

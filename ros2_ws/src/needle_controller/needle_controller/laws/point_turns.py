@@ -92,7 +92,8 @@ def write_need(target: Array, need: Array) -> float:
     angle = math.atan2(across, target[2])
     length = math.sqrt(square) * angle / math.sin(angle)
     # The arc's curvature is 2 across / square.
-    need[:] = target[:2] * (length * length / square)
+    for i in range(2):
+        need[i] = target[i] * (length * length / square)
     return length
 
 

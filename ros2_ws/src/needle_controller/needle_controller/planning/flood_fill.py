@@ -125,9 +125,9 @@ def _is_entered(
                 continue
             slack = _UNCERTAIN + _sag(step + 2.0 * _UNCERTAIN, curvature)
             clear = True
-            for capsule in capsules:
-                distance = segment_distance(first, cell, capsule, capsule[3:])
-                if distance < capsule[6] - slack:
+            for k in range(len(capsules)):
+                distance = segment_distance(first, cell, capsules[k], capsules[k, 3:])
+                if distance < capsules[k, 6] - slack:
                     clear = False
                     break
             if clear:

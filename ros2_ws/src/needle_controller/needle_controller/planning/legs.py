@@ -199,12 +199,9 @@ def trace_leg(
     end : ndarray, shape (3, 4), changed
         The tip's pose at the end.
     """
-    end[:] = pose
-    points[0, :3] = pose[:, 3]
-    points[0, 3] = length
+    _write_corner(points[0], pose, length)
     count = 1
-    if leg.turning == 0.0:
-        advance_pose(end, 0.0, leg.turn, 0.0, end)
+    advance_pose(pose, 0.0, leg.turn if leg.turning == 0.0 else 0.0, 0.0, end)
     parts = (
         (leg.turning, leg.turn, curvature, _LONGEST_CHORD),
         (leg.bend, 0.0, leg.curvature, _LONGEST_CHORD),
@@ -217,7 +214,14 @@ def trace_leg(
         for _ in range(pieces):
             advance_pose(end, inserted / pieces, turn / pieces, bend, end)
             length += inserted / pieces
-            points[count, :3] = end[:, 3]
-            points[count, 3] = length
+            _write_corner(points[count], end, length)
             count += 1
     return count
+
+
+@compiled
+def _write_corner(point: Array, pose: Array, length: float) -> None:
+    # Number by number: the assignment of a slice takes seconds to compile.
+    for i in range(3):
+        point[i] = pose[i, 3]
+    point[3] = length

@@ -225,7 +225,7 @@ def evaluate_path(legs: Array, problem: PathProblem, shortest: float) -> PathEva
         length += legs[i, 3]
         if i + 1 < legs.shape[0]:
             short += max(shortest - legs[i, 3], 0.0)
-        pose[:] = end
+        pose, end = end, pose
     # With a+ = max(a, 0): J = length + p_c (preferred_margin - margin)+ + p_m gentle_miss + p_v v,
     # v = (-margin)+ + (miss - tolerance)+ + (length - reach)+ + sum (shortest - length of a leg)+.
     violation = max(-margin, 0.0) + max(miss - settings.goal_tolerance, 0.0)

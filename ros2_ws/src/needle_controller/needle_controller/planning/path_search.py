@@ -111,7 +111,8 @@ def optimize_legs(legs: Array, problem: PathProblem, draws: Array) -> PathEvalua
             costs[k] = assessed.cost
             if assessed.cost < best.cost:
                 best = assessed
-                legs[:] = candidate
+                for i in range(4 * legs.shape[0]):
+                    legs[i // 4, i % 4] = candidate[i // 4, i % 4]
             rank = k
             while rank > 0 and costs[order[rank - 1]] > costs[k]:
                 order[rank] = order[rank - 1]
