@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 
 from needle_controller.model.arrays import Array
-from needle_core.errors import OutOfBoundsError, UserError
+from needle_core.commands.options import number
+from needle_core.errors import UserError
+from needle_core.files.yaml_files import read_text
 from needle_core.message_types import to_nanoseconds
 
 _COORDINATES = ("x_m", "y_m", "z_m")
-_LARGEST_COORDINATE = 1.0
+_LARGEST = {"m": 1.0, "rad": 1e4}
+"""Largest plausible value, by its unit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,10 +137,6 @@ def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
         if all(not row[name].strip() for name in _COORDINATES):
             continue
         tips.append([_number(path, line, row, name) for name in _COORDINATES])
-        for value, name in zip(tips[-1], _COORDINATES, strict=True):
-            if abs(value) > _LARGEST_COORDINATE:
-                bound = _LARGEST_COORDINATE
-                raise OutOfBoundsError(f"{path}:{line}: {name}", value, -bound, bound, "m")
         if of_name is not None:
             # By the image's name with or without its suffix, as in `track_images`.
             length = of_name.get(row["name"], of_name.get(Path(row["name"]).stem))
@@ -215,18 +214,12 @@ def _read_joints(message: Any, joints: dict[int, list[float]]) -> None:
 
 def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
     """Return (line number, column to text) of every row."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, restval="")
-            rows = []
-            for row in reader:
-                extra = row.pop(None, None)
-                if extra is not None:
-                    raise UserError(f"{path}:{reader.line_num}: more fields than columns")
-                rows.append((reader.line_num, {k.strip(): v for k, v in row.items()}))
-            return rows
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
+    reader, rows = csv.DictReader(read_text(path).splitlines(), restval=""), []
+    for row in reader:
+        if None in row:
+            raise UserError(f"{path}:{reader.line_num}: more fields than columns")
+        rows.append((reader.line_num, {k.strip(): v for k, v in row.items()}))
+    return rows
 
 
 def _insertions(path: Path) -> dict[str, float]:
@@ -242,11 +235,6 @@ def _insertions(path: Path) -> dict[str, float]:
 
 
 def _number(path: Path, line: int, row: Mapping[str, str], name: str) -> float:
-    text = row[name].strip()
-    try:
-        value = float(text)
-    except ValueError:
-        raise UserError(f"{path}:{line}: {name} = '{text}' is not a number") from None
-    if not math.isfinite(value):
-        raise UserError(f"{path}:{line}: {name} = {text} is not finite")
-    return value
+    unit = name.rpartition("_")[2]
+    largest = _LARGEST[unit]
+    return number(f"{path}:{line}: {name}", row[name].strip(), -largest, largest, unit)

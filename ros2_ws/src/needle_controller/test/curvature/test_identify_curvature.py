@@ -120,8 +120,8 @@ def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
         ("x_m,y_m,z_m\n", "the file has no rows"),
         ("a,b\n1,2\n", "x_m is missing"),
         ("x_m,y_m,z_m\n0,0,0.01\n", "1 tips are too few"),
-        ("x_m,y_m,z_m\n0,0,nan\n", "z_m = nan is not finite"),
-        ("x_m,y_m,z_m\n0,0,left\n", "z_m = 'left' is not a number"),
+        ("x_m,y_m,z_m\n0,0,nan\n", "z_m = nan m is not finite"),
+        ("x_m,y_m,z_m\n0,0,left\n", "z_m 'left' is not a number"),
         ("x_m,y_m,z_m\n0,0,12.5\n", r"z_m = 12.5 m is outside"),
         ("x_m,y_m,z_m\n0,0,1,2\n", "more fields than columns"),
     ):
