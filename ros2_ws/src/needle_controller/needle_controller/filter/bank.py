@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from needle_controller.filter.heading_update import update_by_heading
 from needle_controller.filter.late_tips import FIRST, LAST, hidden_age
-from needle_controller.filter.merging import copy_hypothesis, merge
+from needle_controller.filter.merging import copy_hypothesis, merge, remove_weightless
 from needle_controller.filter.motion import LARGEST_TURN, advance_hypothesis
 from needle_controller.filter.records import E_TURN, ERROR, LONGEST_QUEUE
 from needle_controller.filter.tip_update import (
@@ -338,15 +338,10 @@ def _reweight(needle: Any, hypotheses: Records, reading: Reading, assumed: Any) 
         largest = max(largest, h.weight)
         outlier += h.weight * h.outlier
     outlier /= whole
-    kept = 0
     for n in range(needle.count):
         weight = hypotheses[n].weight / largest
-        if weight > _SMALLEST_WEIGHT:
-            if kept != n:
-                copy_hypothesis(hypotheses, n, hypotheses, kept)
-            hypotheses[kept].weight = weight
-            kept += 1
-    needle.count = kept
+        hypotheses[n].weight = weight if weight > _SMALLEST_WEIGHT else 0.0
+    remove_weightless(needle, hypotheses)
     needle.outlier_probability = outlier
     needle.mean_outlier_probability += _NEWEST_SHARE * (outlier - needle.mean_outlier_probability)
     _add_jump_hypotheses(needle, hypotheses, reading, assumed)
@@ -362,12 +357,12 @@ def _add_jump_hypotheses(needle: Any, hypotheses: Records, reading: Reading, ass
     survivors = needle.count
     room = min(hypotheses.size - survivors, 1 + survivors // _SURVIVORS_PER_JUMP)
     for _ in range(room):
-        likeliest, most = -1, _SMALLEST_WEIGHT
+        likeliest, most = survivors, _SMALLEST_WEIGHT
         for n in range(survivors):
             weight = assumed.jump_share * hypotheses[n].weight * hypotheses[n].outlier
             if weight > most:
                 likeliest, most = n, weight
-        if likeliest < 0:
+        if likeliest == survivors:
             return
         copy_hypothesis(hypotheses, likeliest, hypotheses, needle.count)
         hypotheses[likeliest].outlier = 0.0

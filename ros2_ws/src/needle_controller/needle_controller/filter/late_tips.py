@@ -63,10 +63,10 @@ def hidden_age(
             count += 1
     if count < _LEAST_TIPS:
         return 0.0
-    middle_missing, off = _median(missing, count), np.empty(count)
+    middle_missing, off = _median(missing[:count]), np.empty(count)
     for k in range(count):
         off[k] = abs(missing[k] - middle_missing)
-    usual = max(_OUTLIER * _median(off, count), bound)
+    usual = max(_OUTLIER * _median(off), bound)
     number, middle, mean = 0, 0.0, 0.0
     for k in range(count):
         if off[k] <= usual:
@@ -94,9 +94,9 @@ def hidden_age(
 
 
 @compiled
-def _median(values: Array, count: int) -> float:
-    """Return the median of the first values."""
-    rank = np.empty(count)
+def _median(values: Array) -> float:
+    # numpy's takes a second to compile.
+    rank, count = np.empty(values.size), values.size
     for k in range(count):
         slot = k
         while slot > 0 and rank[slot - 1] > values[k]:

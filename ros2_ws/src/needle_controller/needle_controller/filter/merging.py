@@ -33,6 +33,17 @@ def copy_hypothesis(source: Records, n: int, target: Records, m: int) -> None:
 
 
 @compiled
+def remove_weightless(needle: Any, hypotheses: Records) -> None:
+    """Remove the hypotheses with weight 0; the others keep their order."""
+    count, needle.count = needle.count, 0
+    for n in range(count):
+        if hypotheses[n].weight > 0.0:
+            if needle.count != n:
+                copy_hypothesis(hypotheses, n, hypotheses, needle.count)
+            needle.count += 1
+
+
+@compiled
 def merge(needle: Any, hypotheses: Records) -> None:
     """Merge equal hypotheses of the same torsion and noise.
 
@@ -47,13 +58,7 @@ def merge(needle: Any, hypotheses: Records) -> None:
             a, b = hypotheses[first], hypotheses[second]
             if a.weight > 0.0 and b.weight > 0.0 and _are_same(a, b):
                 _join(a, b, difference)
-    kept = 0
-    for n in range(needle.count):
-        if hypotheses[n].weight > 0.0:
-            if kept != n:
-                copy_hypothesis(hypotheses, n, hypotheses, kept)
-            kept += 1
-    needle.count = kept
+    remove_weightless(needle, hypotheses)
 
 
 @compiled
