@@ -71,8 +71,8 @@ def compare(tips: Array, truth: Array) -> tuple[float, float, bool]:
         Position at the depth of the forecast [m].
     """
     given = tips[tips[:, 2] <= GIVEN]
-    checked = fit_checked(given, None, CurvatureFitSettings(repeating_error=2e-5))
-    ahead = forecast_tip(given, False, checked, AHEAD)
+    fit = fit_checked(given, None, CurvatureFitSettings(repeating_error=2e-5))
+    ahead = forecast_tip(given, fit, AHEAD)
     # The forecast is for a length of path, the truth for a depth.
     slope = ahead.tip[:2] / ahead.tip[2]
     off = ahead.tip[:2] + slope * (AHEAD - ahead.tip[2]) - truth

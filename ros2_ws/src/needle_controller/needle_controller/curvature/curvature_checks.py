@@ -27,28 +27,9 @@ _CONTRADICTION = 4.0
 """Difference above which the tips contradict a prior [standard deviations]."""
 
 
-@dataclasses.dataclass(frozen=True)
-class CheckedFit:
-    """A fit without the priors that the tips contradict.
-
-    Attributes
-    ----------
-    fit : CurvatureFit
-        The fit.
-    settings : CurvatureFitSettings
-        Settings used for it.
-    warnings : tuple of str
-        A line for each unused prior.
-    """
-
-    fit: CurvatureFit
-    settings: CurvatureFitSettings
-    warnings: tuple[str, ...]
-
-
 def fit_checked(
     tips: npt.ArrayLike, insertion: npt.ArrayLike | None, settings: CurvatureFitSettings
-) -> CheckedFit:
+) -> CurvatureFit:
     """Return the fit of one needle without the priors that its tips contradict.
 
     An arc is first fitted without entry and heading; a prior that differs from it by more than four
@@ -65,7 +46,7 @@ def fit_checked(
 
     Returns
     -------
-    CheckedFit
+    CurvatureFit
         The fit, with a warning for each unused prior.
 
     Raises
@@ -112,7 +93,8 @@ def fit_checked(
                 f"limit {math.degrees(allowed):.1f} deg"
             )
             settings = dataclasses.replace(settings, heading=(x, y, z), heading_std=math.inf)
-    return CheckedFit(fit_curvature(tips, insertion, settings), settings, tuple(warnings))
+    fit = fit_curvature(tips, insertion, settings)
+    return dataclasses.replace(fit, warnings=tuple(warnings))
 
 
 def neighbour_correlation(residuals: Array) -> tuple[float, float]:

@@ -123,6 +123,12 @@ class CurvatureFit:
         heading, and the needle's insertion per insertion of the stage, less 1.
     length : ndarray, shape (..., K)
         Insertion of the stage at each tip [m]; of the needle if that of the stage is not known.
+    insertion_known : bool
+        Whether the insertion of the stage is known.
+    settings : CurvatureFitSettings
+        Priors used.
+    warnings : tuple of str
+        A line for each unused prior; see `curvature_checks.fit_checked`.
     """
 
     curvature: Array
@@ -138,6 +144,9 @@ class CurvatureFit:
     slip_std: Array
     unknowns: Array
     length: Array
+    insertion_known: bool
+    settings: CurvatureFitSettings
+    warnings: tuple[str, ...] = ()
 
     @property
     def radius(self) -> Array:
@@ -239,6 +248,8 @@ def fit_curvature(
         slip_std=np.sqrt(variances[..., _GAIN]) / (1.0 + unknowns[..., _GAIN]) ** 2,
         unknowns=unknowns,
         length=length,
+        insertion_known=known,
+        settings=settings,
     )
 
 

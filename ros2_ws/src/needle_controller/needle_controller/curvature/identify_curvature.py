@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from needle_controller.curvature.curvature_checks import (
-    CheckedFit,
     check_independent_residuals,
     fit_checked,
 )
 from needle_controller.curvature.curvature_data import InsertionRecord, read_record
-from needle_controller.curvature.curvature_fit import CurvatureFitSettings, circle_curvature
+from needle_controller.curvature.curvature_fit import (
+    CurvatureFit,
+    CurvatureFitSettings,
+    circle_curvature,
+)
 from needle_controller.curvature.tip_forecast import forecast_tip
 from needle_core.commands.cli import (
     EXIT_DONE,
@@ -136,7 +139,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     return options
 
 
-def identify(options: argparse.Namespace) -> tuple[InsertionRecord, CheckedFit]:
+def identify(options: argparse.Namespace) -> tuple[InsertionRecord, CurvatureFit]:
     """Read and check the tips, and fit the curvature; raises UserError."""
     record = read_record(options.source, options.insertion)
     record = record.between(options.from_mm * 1e-3, options.until_mm * 1e-3)
@@ -147,17 +150,16 @@ def identify(options: argparse.Namespace) -> tuple[InsertionRecord, CheckedFit]:
         repeating_error=options.repeating_error_mm * 1e-3,
     )
     try:
-        checked = fit_checked(record.tips, record.insertion, settings)
+        fit = fit_checked(record.tips, record.insertion, settings)
         if record.rotation is None:
-            check_independent_residuals(checked.fit.residuals, settings.repeating_error)
-        return record, checked
+            check_independent_residuals(fit.residuals, settings.repeating_error)
+        return record, fit
     except UserError as error:
         raise UserError(f"{options.source}: {error}") from error
 
 
-def summary(record: InsertionRecord, checked: CheckedFit) -> dict[str, JsonValue]:
+def summary(record: InsertionRecord, fit: CurvatureFit) -> dict[str, JsonValue]:
     """Return the result as a flat object."""
-    fit = checked.fit
     low, high = (float(radius) for radius in fit.radius_interval())
     if record.insertion is not None:
         arc = float(np.max(record.insertion))
@@ -178,20 +180,18 @@ def summary(record: InsertionRecord, checked: CheckedFit) -> dict[str, JsonValue
         "slip_std": float(fit.slip_std) if record.insertion is not None else None,
         "insertion_known": record.insertion is not None,
         "rotation_known": record.rotation is not None,
-        "warnings": "; ".join(checked.warnings),
+        "warnings": "; ".join(fit.warnings),
     }
 
 
 def _forecast(
-    options: argparse.Namespace, record: InsertionRecord, checked: CheckedFit
+    options: argparse.Namespace, record: InsertionRecord, fit: CurvatureFit
 ) -> dict[str, JsonValue]:
     """Return the predicted tip and half the widths of its 95 % intervals, if requested."""
     names = [f"forecast_{what}_mm" for what in ("x", "y", "z", "x_95", "y_95", "z_95")]
     if options.forecast_mm is None:
         return dict.fromkeys(names)
-    ahead = forecast_tip(
-        record.tips, record.insertion is not None, checked, 1e-3 * options.forecast_mm
-    )
+    ahead = forecast_tip(record.tips, fit, 1e-3 * options.forecast_mm)
     values = 1e3 * np.concatenate([ahead.tip, ahead.interval()])
     return dict(zip(names, values.tolist(), strict=True))
 
@@ -204,17 +204,16 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     options = parse(arguments)
-    record, checked = identify(options)
-    values = summary(record, checked)
-    fit = checked.fit
-    for warning in checked.warnings:
+    record, fit = identify(options)
+    values = summary(record, fit)
+    for warning in fit.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     if record.rotation is None:
         print(
             "warning: the rotation of the base is not recorded; the tips follow one arc",
             file=sys.stderr,
         )
-    values |= _forecast(options, record, checked)
+    values |= _forecast(options, record, fit)
     if options.json is not None:
         write_json(options.json, values)
     low, high = (1e3 * float(radius) for radius in fit.radius_interval())

@@ -18,7 +18,7 @@ import dataclasses
 
 import numpy as np
 
-from needle_controller.curvature.curvature_checks import CheckedFit
+from needle_controller.curvature.curvature_fit import CurvatureFit
 from needle_controller.curvature.insertion_arc import BEND, UNKNOWNS, arc_points, frame
 from needle_controller.model.arrays import Array
 
@@ -52,28 +52,24 @@ class TipForecast:
         return np.asarray(1.96 * np.sqrt(np.diagonal(self.covariance)))
 
 
-def forecast_tip(
-    tips: Array, insertion_known: bool, checked: CheckedFit, insertion: float
-) -> TipForecast:
+def forecast_tip(tips: Array, fit: CurvatureFit, insertion: float) -> TipForecast:
     """Return the predicted tip at an insertion without rotation.
 
     Parameters
     ----------
     tips : ndarray, shape (K, 3)
         Measured tips in `rig` [m].
-    insertion_known : bool
-        Whether the fit used their insertion; if not, `insertion` is measured along the path.
-    checked : CheckedFit
+    fit : CurvatureFit
         Fit of the arc through the tips.
     insertion : float
-        Insertion of the forecast, > 0 [m].
+        Insertion of the forecast, > 0, along the path if that of the tips is not known [m].
 
     Returns
     -------
     TipForecast
         Predicted tip and its uncertainty, for the fitted noise.
     """
-    fit, settings = checked.fit, checked.settings
+    settings, insertion_known = fit.settings, fit.insertion_known
     axes, entry = frame(np.asarray(settings.heading)), np.asarray(settings.entry)
     length = np.append(fit.length, insertion)
     stations = length * (1.0 + fit.unknowns[UNKNOWNS])

@@ -19,10 +19,8 @@ from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
 
 ONE_SIDED_PRESETS = ("paper", "open_loop")
-"""Presets whose coordinates are limited to roll +-90 deg."""
+"""Presets whose coordinates are limited to roll +-90 deg: they cannot steer to a point."""
 PRESETS = ("best", *ONE_SIDED_PRESETS)
-POINT_PRESETS = ("best",)
-"""Presets that estimate the whole pose, and can steer to a point."""
 INSERTIONS = ("stepwise", "continuous")
 TIP_NOISES = ("bounded", "normal")
 TIP_COVARIANCES = ("configured", "from_tip_pose")
@@ -314,7 +312,7 @@ class SteeringSettings:
         if not self.steers_to_points:
             raise UserError(
                 f"preset {self.preset} cannot steer to a point (it does not estimate the whole "
-                f"pose); {', '.join(POINT_PRESETS)} can"
+                "pose); best can"
             )
         if self.flip_depths:
             raise UserError("a target point and flip_depths do not go together")
@@ -324,7 +322,7 @@ class SteeringSettings:
         """Whether the law can steer to points."""
         if self.law:
             return callable(getattr(own_part("law", self.law).cls, "to_point", None))
-        return self.preset in POINT_PRESETS
+        return self.preset not in ONE_SIDED_PRESETS
 
     def check_plane(self, plane: TargetPlane) -> None:
         """Check that a target plane can be reached; raises UserError."""

@@ -35,9 +35,7 @@ def refused(tips: Array, insertion: Array | None) -> int:
     count = 0
     for each in tips:
         try:
-            check_independent_residuals(
-                fit_checked(each, insertion, settings).fit.residuals, REPEATING
-            )
+            check_independent_residuals(fit_checked(each, insertion, settings).residuals, REPEATING)
         except UserError:
             count += 1
     return count
@@ -69,7 +67,7 @@ def test_repeating_errors_are_tolerated() -> None:
     bowed = tips[0] + noise(tips[0].shape, 2e-6, rng)
     bowed[:, 1] += REPEATING * np.sin(6.0 * np.pi * insertion / 0.12)
     assert refused(bowed[None], insertion) == 0
-    off = fit_checked(bowed, insertion, CurvatureFitSettings()).fit.residuals
+    off = fit_checked(bowed, insertion, CurvatureFitSettings()).residuals
     shared, significance = neighbour_correlation(off)
     assert significance > 10.0
     assert 0.3 * REPEATING < shared < REPEATING

@@ -114,7 +114,7 @@ def test_contradicted_priors_are_not_used_and_reported() -> None:
     turn = Rotation.from_rotvec([0.0, 1.3, 0.0]).as_matrix()
     tips = uniform(exact[0], rng) @ turn.T + [0.02, -0.03, 0.2]
     checked = fit_checked(tips, insertion, CurvatureFitSettings())
-    assert float(checked.fit.radius) == pytest.approx(RADIUS, rel=0.08)
+    assert float(checked.radius) == pytest.approx(RADIUS, rel=0.08)
     assert [w.split(" was")[0] for w in checked.warnings] == ["the entry", "the heading"]
     good = fit_checked(uniform(exact[0], rng), insertion, CurvatureFitSettings())
     assert good.warnings == ()

@@ -32,8 +32,8 @@ def arc(radius: float, length: Array) -> Array:
 def test_an_arc_is_continued(radius: float, insertion_known: bool) -> None:
     noise = np.random.default_rng(4).normal(0.0, NOISE, (len(INSERTION), 3))
     tips = arc(radius, INSERTION) + noise
-    checked = fit_checked(tips, INSERTION if insertion_known else None, CurvatureFitSettings())
-    ahead = forecast_tip(tips, insertion_known, checked, AHEAD)
+    fit = fit_checked(tips, INSERTION if insertion_known else None, CurvatureFitSettings())
+    ahead = forecast_tip(tips, fit, AHEAD)
     off = np.abs(ahead.tip - arc(radius, np.array(AHEAD)))
     assert np.all(off <= 1.3 * ahead.interval() + 1e-5)
     # The forecast is limited by the tissue, and better than a parabola.
@@ -50,11 +50,10 @@ def test_the_forecast_of_a_straight_needle_is_gaussian_process_regression(
     # The needle moves so little aside that the sine of its heading equals the heading.
     bends = np.random.default_rng(5).normal(0.0, 1e-6, (len(INSERTION), 2))
     seen = np.column_stack([np.cumsum(np.cumsum(bends, axis=0), axis=0), INSERTION])
-    checked = fit_checked(seen, INSERTION, settings)
+    fit = fit_checked(seen, INSERTION, settings)
     # Known noise, no outliers.
-    known_noise = {"measurement_std": np.array(NOISE), "weights": np.ones(len(INSERTION))}
-    fit = dataclasses.replace(checked.fit, **known_noise)
-    ahead = forecast_tip(seen, True, dataclasses.replace(checked, fit=fit), AHEAD)
+    fit = dataclasses.replace(fit, measurement_std=np.array(NOISE), weights=np.ones(len(INSERTION)))
+    ahead = forecast_tip(seen, fit, AHEAD)
     places = np.append(INSERTION, AHEAD)
     cells = np.arange(0.0005, AHEAD, 0.001)
     moved = np.maximum(places[:, None] - cells, 0.0) * 0.001
