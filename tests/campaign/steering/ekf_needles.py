@@ -107,7 +107,7 @@ class EkfNeedles:
 
     def _rates(self) -> FloatArray:
         turns = np.empty(self._needles.size)
-        sign = self._plan.bend_sign(self._insertion) if self._plan.depths else 0.0
+        sign = self._plan.bend_sign(self._insertion)
         _turn_all(self._needles, np.zeros(1, TORSION), sign, self._law, turns)
         return turns / self._law.step_length
 

@@ -87,7 +87,7 @@ def best_rates(settings: SteeringSettings) -> Callable[[ManyFilters, float], Flo
     law, plan = RollLawSettings(**settings.turning), FlipPlan(settings.flip_depths)
 
     def rates(filters: ManyFilters, insertion: float) -> FloatArray:
-        return filters.roll_rates(law, plan.bend_sign(insertion) if plan.depths else 0.0)
+        return filters.roll_rates(law, plan.bend_sign(insertion))
 
     return rates
 

@@ -14,7 +14,6 @@ from needle_controller.filter.bank import advance_needle, correct_needle, start_
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.mixture import estimate_from_record, estimate_needle
 from needle_controller.filter.records import ERROR, ESTIMATE, EVENT, HYPOTHESIS, NEEDLE, TORSION
-from needle_controller.model.arrays import Array
 from needle_controller.observers.estimator import Estimate
 
 AMBIGUOUS_WEIGHT = 0.1
@@ -56,11 +55,6 @@ class HypothesisFilter:
         self._hypotheses = np.zeros(self._prior.size + 1, HYPOTHESIS)
         self._events = np.zeros(_EVENTS, EVENT)
         self.reset(np.zeros(3), np.zeros(2))
-
-    @property
-    def initial_rotation(self) -> Array:
-        """Orientation of a needle at its entry with the base's rotation at 0, shape (3, 3)."""
-        return np.array(self.needle["initial_rotation"])
 
     @property
     def hypotheses(self) -> npt.NDArray[np.void]:

@@ -56,7 +56,7 @@ class FlipPlan:
             raise OutOfBoundsError(f"flip {number}", self.depths[-1], 0.0, depth, "m")
 
     def bend_sign(self, insertion: float) -> float:
-        """Return the desired sign of cos(roll), +1 or -1, at an insertion.
+        """Return the desired sign of cos(roll), +1 or -1, at an insertion; 0 without flips.
 
         Parameters
         ----------
@@ -64,6 +64,8 @@ class FlipPlan:
             Insertion depth [m]; at the depth of a flip, within 1 um, the sign is that after the
             flip.
         """
+        if not self.depths:
+            return 0.0
         done = sum(depth <= insertion + DEPTH_TOLERANCE for depth in self.depths)
         return 1.0 if done % 2 == 0 else -1.0
 

@@ -56,8 +56,6 @@ def observer_settings(settings: SteeringSettings, gains: Gains) -> ObserverSetti
 def roll_law(settings: SteeringSettings) -> StepLaw:
     """Return the law of preset `best`; without flips the needle bends to the nearer side."""
     law, plan = RollLaw(RollLawSettings(**settings.turning)), FlipPlan(settings.flip_depths)
-    if not plan.depths:
-        return lambda estimate, _: law(estimate)
     return lambda estimate, insertion: law(estimate, plan.bend_sign(insertion))
 
 

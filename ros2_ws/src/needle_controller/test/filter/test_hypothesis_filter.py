@@ -195,7 +195,7 @@ def test_a_change_of_frame_keeps_the_needle(noise: NoiseHypothesis) -> None:
         moved.covariance / np.outer(scale, scale),
         atol=1e-4,
     )
-    np.testing.assert_allclose(old.initial_rotation, new.initial_rotation)
+    np.testing.assert_allclose(old.needle["initial_rotation"], new.needle["initial_rotation"])
 
 
 @pytest.mark.parametrize(
