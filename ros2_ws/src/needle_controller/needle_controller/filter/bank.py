@@ -288,9 +288,7 @@ def _estimated_age(needle: Any, events: Records, assumed: Any) -> float:
         too_deep, entry_std = -needle.start_insertion, _ENTRY_STD
         for i in range(3):
             too_deep += (needle.start[i] - needle.entry[i]) * needle.initial_rotation[i, 2]
-    return hidden_age(
-        inserted, shifts, too_deep, entry_std, assumed.effective_bound, assumed.scale_spread
-    )
+    return hidden_age(inserted, shifts, too_deep, entry_std, assumed.effective_bound)
 
 
 @compiled

@@ -153,6 +153,9 @@ small normal noise, small errors would look like correlated ones."""
 
 _CURVATURE_SPREAD = 0.22
 """Initial standard deviation of the curvature, relative to it."""
+SCALE_SPREAD = 0.04
+"""Initial standard deviation of the insertion scale, the needle's insertion per insertion of the
+stage, about 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,11 +170,8 @@ class FilterSettings:
         Smallest and largest estimated curvature, relative to `curvature`.
     curvature_drift : float
         Growth of the relative standard deviation over a metre [1/sqrt(m)].
-    scale_spread : float
-        Initial standard deviation of the insertion scale, the needle's insertion per insertion of
-        the stage, about 1.
     scale_drift : float
-        Growth of this standard deviation over a metre [1/sqrt(m)].
+        Growth of the standard deviation of the insertion scale over a metre [1/sqrt(m)].
     tip_noise_bound : float
         Claimed largest error of a measured coordinate of tips without covariance [m].
     outlier_share : float
@@ -195,7 +195,6 @@ class FilterSettings:
     curvature: float = 1.0 / 0.122
     curvature_range: tuple[float, float] = (0.2, 1.6)
     curvature_drift: float = 0.02 * math.sqrt(1000.0)
-    scale_spread: float = 0.04
     scale_drift: float = 0.01
     tip_noise_bound: float = 0.001
     outlier_share: float = 0.1
@@ -230,7 +229,6 @@ class FilterSettings:
         assumed["smallest_curvature"] = self.curvature_range[0] * self.curvature
         assumed["largest_curvature"] = self.curvature_range[1] * self.curvature
         assumed["curvature_drift"] = (self.curvature_drift * self.curvature) ** 2
-        assumed["scale_spread"] = self.scale_spread
         assumed["scale_drift"] = self.scale_drift**2
         assumed["torsion_drift"] = self.play_drift**2, self.lag_drift**2, 0.0
         assumed["effective_bound"] = self.effective_bound
@@ -273,6 +271,6 @@ class FilterSettings:
             covariance[E_TURN + 2, E_TURN + 2] = roll.std**2
             covariance[E_KAPPA, E_KAPPA] = (_CURVATURE_SPREAD * self.curvature) ** 2
             covariance[E_TORSION, E_TORSION] = torsion.parameter_std**2
-            covariance[E_SCALE, E_SCALE] = self.scale_spread**2
+            covariance[E_SCALE, E_SCALE] = SCALE_SPREAD**2
         prior["weight"] /= np.max(prior["weight"])
         return prior

@@ -5,14 +5,13 @@ the base as a lag of the tip. With late tips, the same length of insertion is mi
 millimetres on; with a needle that slips, the missing length grows.
 """
 
-# Numba functions take positional arguments: keywords are slow or unsupported.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
 
 import numpy as np
 
+from needle_controller.filter.filter_settings import SCALE_SPREAD
 from needle_controller.model.arrays import Array
 from needle_core.compiled import compiled
 
@@ -25,12 +24,7 @@ _OUTLIER = 4.0
 
 @compiled
 def hidden_age(
-    inserted: Array,
-    shifts: Array,
-    too_deep: float,
-    entry_std: float,
-    bound: float,
-    scale_spread: float,
+    inserted: Array, shifts: Array, too_deep: float, entry_std: float, bound: float
 ) -> float:
     """Return the hidden age of tips, in insertion [m]; 0 if it is not significant.
 
@@ -49,8 +43,6 @@ def hidden_age(
         Standard deviation of the entry [m]; infinite if it is not known.
     bound : float
         Largest claimed error of a coordinate [m].
-    scale_spread : float
-        Standard deviation of the insertion scale.
     """
     least, count = bound**2 / 3.0, 0
     at, missing = np.empty(inserted.size), np.empty(inserted.size)
@@ -81,10 +73,8 @@ def hidden_age(
         products += (at[k] - middle) * (missing[k] - mean)
         across += (missing[k] - mean) ** 2
     noise = max(across / number, least)
-    # missing = age + slip inserted, with the prior N(0, scale_spread^2) of the slip.
-    slip_variance = 0.0
-    if scale_spread > 0.0:
-        slip_variance = 1.0 / (squares / noise + scale_spread**-2.0)
+    # missing = age + slip inserted, with the prior N(0, SCALE_SPREAD^2) of the slip.
+    slip_variance = 1.0 / (squares / noise + SCALE_SPREAD**-2.0)
     slip = slip_variance * products / noise
     of_entry = noise / (noise + entry_std**2)
     age = mean - slip * middle - of_entry * too_deep

@@ -119,7 +119,6 @@ ASSUMPTIONS = np.dtype(
         ("smallest_curvature", np.float64),
         ("largest_curvature", np.float64),
         ("curvature_drift", np.float64),
-        ("scale_spread", np.float64),
         ("scale_drift", np.float64),
         ("torsion_drift", np.float64, 3),  # of play, lag and gain
         ("effective_bound", np.float64),
