@@ -24,8 +24,7 @@ emergency stops (device/estop), targets (target_plane, target_point, obstacles) 
 publisher), all topics are; if a rig starts later, the playback ends.
 """
 _EPILOG = """\
-Keys during playback: space pauses and resumes, up and down change the rate by 10 %, right and left
-jump by 5 s. From another terminal:
+To pause, to change the rate or to jump during playback, from another terminal:
   ros2 service call /player/pause std_srvs/srv/SetBool "{data: true}"
   ros2 param set /player rate 0.5
   ros2 param set /player seek 12.5       (seconds after the bag's first message)

@@ -19,15 +19,7 @@ from std_srvs.srv import SetBool
 from tqdm import tqdm
 
 from needle_bags.format.message_definitions import message_class, unplayable
-from needle_bags.player.playback import (
-    BACK,
-    FASTER,
-    FORWARD,
-    PAUSE,
-    SLOWER,
-    Keys,
-    PlaybackClock,
-)
+from needle_bags.player.playback import PlaybackClock
 from needle_bags.player.player_options import (
     MAX_RATE,
     MIN_RATE,
@@ -56,10 +48,8 @@ DISCOVERY: Final = 2.0
 MATCHING: Final = 3.0
 CHECK_PERIOD: Final = 0.1
 ACKNOWLEDGED: Final = 5.0
-MAX_TURN: Final = 0.02  # maximum delay of a signal, a key or a service call [s]
+MAX_TURN: Final = 0.02  # maximum delay of a signal or a service call [s]
 _NANOSECONDS: Final = 1_000_000_000
-RATE_STEP: Final = 1.1
-SEEK_STEP: Final = 5 * _NANOSECONDS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,10 +203,6 @@ class Player(WholeNode):
         """Yield the messages to play, in order, from the current start."""
         return self._messages(self._topics, self._begin, self.end + 1)
 
-    def seek(self, time: int) -> None:
-        """Jump to a recording time [ns], limited to the bag."""
-        self.seek_target = min(max(time, self._contents.start), self.end)
-
     def begin(self) -> None:
         """Start at the seek target, or at the beginning."""
         self._begin = self.start if self.seek_target is None else self.seek_target
@@ -224,17 +210,6 @@ class Player(WholeNode):
             self._publish_latched(self._begin)
         self.seek_target = None
         self.clock.restart(self._begin, time.monotonic())
-
-    def press(self, key: str) -> None:
-        """Handle a key pressed in the terminal."""
-        now = time.monotonic()
-        if key == PAUSE:
-            self.pause(not self.clock.is_paused)
-        elif key in (FASTER, SLOWER):
-            rate = self.clock.rate * (RATE_STEP if key == FASTER else 1.0 / RATE_STEP)
-            self.set_parameters([Parameter("rate", value=min(max(rate, MIN_RATE), MAX_RATE))])
-        elif key in (BACK, FORWARD):
-            self.seek(self.clock.time(now) + (SEEK_STEP if key == FORWARD else -SEEK_STEP))
 
     def publish(self, message: SentMessage) -> None:
         """Publish a message."""
@@ -263,10 +238,6 @@ class Player(WholeNode):
         values = {"bag": str(self._options.bag), "messages": str(self.messages)}
         self._diagnostics.set("playback", Diagnostic(Level.OK, state, values))
 
-    def pause(self, paused: bool) -> None:
-        """Pause or continue."""
-        self.clock.pause(paused, time.monotonic())
-
     def finish(self) -> None:
         """Wait until all subscribers have received all messages."""
         timeout = Duration(seconds=ACKNOWLEDGED)
@@ -287,10 +258,11 @@ class Player(WholeNode):
             if change.name == "rate":
                 self.clock.set_rate(change.value, time.monotonic())
             elif change.name == "seek":
-                self.seek(self._contents.start + round(change.value * _NANOSECONDS))
+                time_ns = self._contents.start + round(change.value * _NANOSECONDS)
+                self.seek_target = min(time_ns, self.end)
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
-        self.pause(request.data)
+        self.clock.pause(request.data, time.monotonic())
         response.success = True
         response.message = "paused" if request.data else "playing"
         return response
@@ -304,9 +276,9 @@ def _play(player: Player, loop: bool, end: ShutdownFlag) -> int:
         unit="s",
         disable=None,
         leave=False,
-        bar_format="{desc} {bar} {n:.1f}/{total:.1f} s, space bar and arrows",
+        bar_format="{desc} {bar} {n:.1f}/{total:.1f} s",
     )
-    with bar, Keys() as keys:
+    with bar:
         if not player.prepare(partial(executor.spin_once, 0.05), end):
             return EXIT_DONE
         while True:
@@ -325,8 +297,6 @@ def _play(player: Player, loop: bool, end: ShutdownFlag) -> int:
                 player.check_graph()
                 if end.requested:
                     return EXIT_DONE
-                for key in keys.pressed():
-                    player.press(key)
                 elapsed = player.clock.time(time.monotonic()) - player.start
                 bar.n = min(bar.total, elapsed / _NANOSECONDS)
                 bar.set_description("paused" if player.clock.is_paused else "playing")

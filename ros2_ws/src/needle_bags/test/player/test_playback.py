@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_bags.player.playback import BACK, FASTER, FORWARD, PAUSE, SLOWER, PlaybackClock, keys_in
+from needle_bags.player.playback import PlaybackClock
 from needle_bags.player.player_options import parse_options
 from needle_bags.player.replay_names import is_guarded, marks_a_rig, played_name
 from needle_core.errors import UserError
@@ -35,10 +35,6 @@ def test_a_pause_takes_no_time() -> None:
     clock.set_rate(0.5, 61.0)
     clock.pause(False, 70.0)
     assert clock.wait(7 * SECOND, 70.0) == pytest.approx(1.0)
-
-
-def test_arrow_keys_are_decoded() -> None:
-    assert keys_in(" \x1b[A\x1bOBx\x1b[C\x1b[D") == [PAUSE, FASTER, SLOWER, "x", FORWARD, BACK]
 
 
 @pytest.mark.parametrize(
