@@ -178,7 +178,8 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     scene.when(5, lambda: scene.change(seek=11.0))
     # The pause at 11 takes no time of the bag.
     scene.when(11, lambda: scene.pause(True))
-    scene.when(11, lambda: scene.at(10.0, lambda: (scene.pause(False), scene.change(rate=1.1))))
+    scene.when(11, lambda: scene.at(10.0, lambda: scene.pause(False)))
+    scene.when(12, lambda: scene.change(rate=1.1))
     assert scene.play("--regex ^/n|plane --exclude-regex noisy") == 0
     assert scene.numbers("/numbered") == [0, 15, 4, 4, 5, *range(11, COUNT)]
     assert scene.offered() == {"/numbered", "/plane", "/replay/target_plane"}
