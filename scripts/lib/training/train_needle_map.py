@@ -20,6 +20,7 @@ import tempfile
 import time
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 from tqdm import tqdm
@@ -39,8 +40,9 @@ from sample_pool import (
     supply,
     write_scene,
 )
-from training_loop import Plan, new_run, resumed, train
-from training_net import NeedleNet, export
+
+if TYPE_CHECKING:
+    from training_net import NeedleNet
 
 ROOT = Path(__file__).parents[3]
 TRACKER = ROOT / "ros2_ws/src/needle_tracker"
@@ -184,6 +186,9 @@ def read_arguments() -> argparse.Namespace:
 def main() -> int:
     """Trace, draw, train and report; return the exit code."""
     given = read_arguments()
+    # Import late, because --help needs no torch.
+    from training_loop import Plan, new_run, resumed, train  # noqa: PLC0415
+
     checkpoint = given.folder / "checkpoint.pt"
     scenes, samples = given.folder / "scenes", given.folder / "samples"
     cv2.setNumThreads(1)
@@ -222,6 +227,8 @@ def main() -> int:
 
 def print_report(net: NeedleNet, scenes: Path) -> None:
     """Print the figures of a net on the held-out scenes in a folder."""
+    from training_net import export  # noqa: PLC0415
+
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "needle_net.onnx")
         export(net, path)
