@@ -16,8 +16,7 @@ from code_lines import ROOT
 from needle_bags.link.openigtlink import LINK, Listeners
 from needle_bags.ros.player import PlayerParameters
 from needle_bags.ros.recorder import PARAMETERS_OF, RecorderParameters
-from needle_bringup.operator.component import INPUT_DEVICE
-from needle_bringup.operator.hold_debouncer import InputState
+from needle_bringup.operator.component import DEVICE_STOP
 from needle_console.console import CALLS as OF_BUTTONS
 from needle_console.console import PAGE, HoldRequest
 from needle_console.hold.page_session import RELEASED
@@ -104,7 +103,7 @@ def rig_nodes() -> list[RigNode]:
         parts: dict[str, list[str]] = {}
         for when, values in VARIANTS.get(name, {"": {}}).items():
             component = make(parameters(**values), name)
-            calls = [service(CALLS, name) for name in RETRACTION_CALLS.get(name, ())]
+            calls = [service(CALLS, called) for called in LATER_CALLS.get(name, ())]
             for action in _actions(component):
                 match action:
                     case Call():
@@ -146,10 +145,12 @@ def _actions(component: Component) -> Iterator[Action]:
         yield from handlers.run(partial(timer.handler, at))
 
 
-RETRACTION_CALLS = dict.fromkeys(("console", "operator"), (STOP_STEERING, RETRACT))
-"""Calls that depend on the answers of other nodes, by node."""
+LATER_CALLS = {
+    "console": (STOP_STEERING, RETRACT),
+    "operator": (DEVICE_STOP, STOP_STEERING, RETRACT),
+}
+"""Calls that depend on buttons and on the answers of other nodes, by node."""
 ARRIVING: Mapping[str, Sequence[tuple[Any, ...]]] = {
-    INPUT_DEVICE: ((InputState(stop=True),),),
     LINK: ((Listeners(1),),),
     PAGE: (tuple(OF_BUTTONS), (HoldRequest(RELEASED),)),
 }

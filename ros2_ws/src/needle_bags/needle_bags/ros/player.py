@@ -158,19 +158,17 @@ class Player(WholeNode):
             self.destroy_publisher(sender)
         self._senders = {name: self._publisher(topic) for name, topic in self._topics.items()}
         if self._options.clock is not None:
-            name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", {}, beside_rig=self.beside_rig)
+            name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", beside_rig=self.beside_rig)
             self._senders[CLOCK] = self.create_publisher(Clock, name, RELIABLE)
 
     def _publisher(self, topic: BagTopic) -> Publisher:
-        name = played_name(
-            topic.name, topic.type_name, self._options.remaps, beside_rig=self.beside_rig
-        )
+        name = played_name(topic.name, topic.type_name, beside_rig=self.beside_rig)
         publisher = self.create_publisher(
             message_class(topic.type_name),
             name,
             recorded_offer(topic.type_name, topic.offered_qos),
         )
-        # ROS remappings apply after --remap, so check the final name.
+        # ROS remappings apply to this name, so check the final one.
         final = publisher.topic_name
         if not final.startswith(f"{REPLAY}/") and (
             self.beside_rig
@@ -309,10 +307,10 @@ def _play(player: Player, loop: bool, end: ShutdownFlag) -> int:
 def main(args: list[str] | None = None) -> int:
     """Run the player; return the exit code."""
     argv = list(sys.argv if args is None else args)
-    own, ros = _split(argv[1:])
+    ros_from = argv.index("--ros-args") if "--ros-args" in argv else len(argv)
 
     def command() -> int:
-        options = parse_options(own)
+        options = parse_options(argv[1:ros_from])
         contents = read_contents(options.bag)
         require_fits(options, contents)
 
@@ -334,28 +332,11 @@ def main(args: list[str] | None = None) -> int:
             lambda: Player(options, contents),
             help_text="",
             parameters=PlayerParameters,
-            args=[argv[0], *ros],
+            args=[argv[0], *argv[ros_from:]],
             spin=spin,
         )
 
     return run_command(command)
-
-
-def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Return (own arguments, those from `--ros-args` to `--`).
-
-    rclpy would treat the `A:=B` of `--remap` as ROS remappings.
-    """
-    own: list[str] = []
-    ros: list[str] = []
-    inside = False
-    for argument in arguments:
-        inside = (inside or argument == "--ros-args") and argument != "--"
-        if inside:
-            ros.append(argument)
-        elif argument != "--":
-            own.append(argument)
-    return own, ros
 
 
 if __name__ == "__main__":

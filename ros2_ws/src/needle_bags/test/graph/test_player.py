@@ -142,8 +142,8 @@ def test_topics_that_control_a_rig_are_not_played(
 
 def test_part_of_a_bag_under_another_name_at_another_rate(scene: Scene) -> None:
     begin = scene.now
-    options = "--start 2 --end 7 --rate 0.5 --topics numbered --remap numbered:=other --clock 10"
-    assert scene.play(options) == 0
+    scene.remaps = {"/numbered": "/other"}
+    assert scene.play("--start 2 --end 7 --rate 0.5 --topics numbered --clock 10") == 0
     assert scene.numbers("/other") == list(range(2, 8))
     assert scene.offered() == {"/other", "/clock"}
     assert scene.now - begin == pytest.approx(node.DISCOVERY + 10.0, abs=0.2)
