@@ -210,7 +210,7 @@ def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
     in_plane = f"  r1, last 20 mm    {figure('r1_rms_last_20_mm')} mm rms"
     lines = [
         f"{verdict.upper()}: {sentence}",
-        f"  depth             {figure('insertion_final_mm', 1)} mm in {summary.get('steps')} steps",
+        f"  steps             {summary.get('steps')}",
         *([in_plane] if summary.get("point_error_mm") is None else ()),
         f"  tip error         {figure('tip_error_p95_mm')} mm, of which in depth "
         f"{figure('depth_error_p95_mm')} mm (95th percentile)",
