@@ -20,7 +20,7 @@ import yaml
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
-from needle_bringup.workplace import processes_with
+from child_processes import processes_with
 
 T = TypeVar("T")
 # Environment variable that marks every process of a check.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,8 @@ from campaign.checks import (
     check_traced,
     check_tracker,
 )
-from needle_bringup.workplace import checkout, ending_descendants, make_folder, temporary_folder
+from child_processes import ending_descendants
+from needle_bringup.workplace import checkout, make_folder
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
@@ -71,10 +73,10 @@ def _verify(arguments: Sequence[str]) -> int:
     findings: list[tuple[str, Finding]] = []
     keep = given.keep and make_folder("--keep", given.keep, exist_ok=False)
     with (
-        contextlib.nullcontext(keep) if keep else temporary_folder() as folder,
+        contextlib.nullcontext(keep) if keep else tempfile.TemporaryDirectory() as folder,
         ending_descendants(),
     ):
-        bench = Workbench([str(checkout() / "scripts" / "simulate")], folder)
+        bench = Workbench([str(checkout() / "scripts" / "simulate")], Path(folder))
         for step, check in checks:
             for finding in _findings(check, bench):
                 findings.append((step, finding))

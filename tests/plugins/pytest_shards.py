@@ -22,9 +22,9 @@ from typing import Any
 import pytest
 
 import compile_ahead
+from child_processes import processes_with
 from cpu_budget import CpuBudget
 from needle_bringup.studies import monte_carlo
-from needle_bringup.workplace import processes_with
 from needle_core.process.ros_domain import reserve_domain_id
 
 SHARDS = os.cpu_count() or 1

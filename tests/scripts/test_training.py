@@ -11,11 +11,15 @@ import cv2
 import numpy as np
 import pytest
 
+from code_lines import ROOT
 from needle_bringup.training.samples import BORDER, CANVAS, SIZE, Sample
+from needle_bringup.training.traced_scenes import TracedScene
 from needle_tracker.detector.needle_net import normalized
+from net_report import end_error, peaks, report
 from sample_pool import CONTEXT, SHARD, Pool, batch_of, read_shard, write_shard
 
 TRAINING = "only scripts/train_needle_map installs torch and onnx"
+WEIGHTS = ROOT / "ros2_ws/src/needle_tracker/needle_tracker/detector/needle_net.onnx"
 END = np.array([60.0, 90.0])
 _COUNT = 16
 
@@ -27,7 +31,7 @@ def flat_sample(rng: np.random.Generator) -> Sample:
     grain = rng.normal(60.0, 3.0, share.shape)
     image = np.clip(grain + 0.5 * share, 0, 255).astype(np.uint8)
     background = np.clip(grain, 0, 255).astype(np.uint8) if rng.random() < 0.5 else None
-    return Sample(image, background, share, END.copy(), 5.0)
+    return Sample(image, background, share, END.copy())
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +73,9 @@ def test_a_background_that_is_not_known_is_zero(folder: Path) -> None:
     batch = batch_of([(shard, i) for i in range(_COUNT)], [0] * _COUNT, [False] * _COUNT)
     side = SIZE + 2 * CONTEXT
     assert batch.inputs.shape == (_COUNT, 2, side, side)
-    assert 0 < batch.known.sum() < _COUNT
-    np.testing.assert_array_equal(batch.inputs[:, 1].any(axis=(1, 2)), batch.known)
+    known = shard.known[:_COUNT]
+    assert 0 < known.sum() < _COUNT
+    np.testing.assert_array_equal(batch.inputs[:, 1].any(axis=(1, 2)), known)
 
 
 def test_an_end_outside_the_patch_is_none(tmp_path: Path) -> None:
@@ -197,17 +202,36 @@ def test_a_net_from_stored_weights_equals_the_stored_net(tmp_path: Path) -> None
 
 
 def test_a_peak_is_judged_along_and_across_the_shaft() -> None:
-    torch_and_loop()
-    report = pytest.importorskip("net_report")
     rows, columns = np.indices((80, 80))
     share = ((np.abs(rows - 40) < 3) & (columns < 50)).astype(float)
     end = np.array([49.5, 40.0])
     peak = np.exp(-0.5 * (((columns - 51.2) / 2.0) ** 2 + ((rows - 40.0) / 0.5) ** 2))
     intensity = 0.9 * peak / peak.sum()
-    error = report.end_error(intensity, share, end)
+    error = end_error(intensity, share, end)
+    assert error is not None
     assert error.along == pytest.approx(1.7, abs=0.15)
     assert error.across == pytest.approx(0.0, abs=0.05)
     assert error.sigmas == pytest.approx(0.85, rel=0.2)
-    np.testing.assert_array_equal(report.peaks(intensity + 1e-9), [[51, 40]])
-    assert report.end_error(0.3 * intensity, share, end) is None
-    assert not len(report.peaks(0.3 * intensity))
+    np.testing.assert_array_equal(peaks(intensity + 1e-9), [[51, 40]])
+    assert end_error(0.3 * intensity, share, end) is None
+    assert not len(peaks(0.3 * intensity))
+
+
+def test_the_report_counts_ends_and_false_ends_by_width_and_background() -> None:
+    share = np.zeros((160, 240), np.uint8)
+    share[77:82, :121] = 255
+    floor = np.full(share.shape, 120, np.uint8)
+    images = np.stack([floor, floor, np.where(share, 30, floor).astype(np.uint8), floor])
+    shares = np.stack([0 * share, 0 * share, share, share])
+    ends = np.array([[np.nan, np.nan], [np.nan, np.nan], [120.5, 79.0], [np.nan, np.nan]])
+    scene = TracedScene(images, shares, ends, np.full(4, 5.0))
+    head, *rows = report(WEIGHTS.read_bytes(), [scene]).splitlines()
+    assert [line.split()[:5] for line in rows] == [
+        ["4", "to", "6", known, "1"] for known in ("no", "yes")
+    ]
+    for line in rows:
+        assert len(line) == len(head)
+        (*_, seen, along, across, _, others, empty, false) = line.split()
+        assert (seen, others, empty, false) == ("100.0%", "0.00", "2", "0.00")
+        assert float(along) < 3.0
+        assert float(across) < 1.0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import inspect
+import re
 from collections.abc import Iterator
 from xml.etree import ElementTree
 
@@ -13,10 +15,18 @@ from code_lines import ROOT
 from needle_core.settings.parameter_fields import specs
 from reference.command_pages import commands_page, scripts
 from reference.diagnostic_pages import diagnostic_texts
-from reference.endpoints import PUBLISHES, SOURCES, SUBSCRIBES
+from reference.endpoints import PUBLISHES, SERVES, SOURCES, SUBSCRIBES
 from reference.markdown import code
 from reference.node_pages import topics_page
-from reference.rig_nodes import IN_EVERY_NODE, RigNode, executables, rig_nodes
+from reference.rig_nodes import (
+    IN_EVERY_NODE,
+    NOT_COMPONENTS,
+    RigNode,
+    executables,
+    rig_nodes,
+)
+
+IN_EVERY_BAG = ("/diagnostics", "/rosout", "/parameter_events")
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +54,10 @@ def test_recorded_topics_are_in_the_reference_with_their_types(nodes: list[RigNo
     for topic in (each["topic_metadata"] for each in recorded):
         name, kind = topic["name"], topic["type"].replace("/msg/", "/")
         # `small_bag` has compressed its images.
-        if name.endswith("/compressed") or name in ("/rosout", "/parameter_events"):
+        if name.endswith("/compressed") or name in IN_EVERY_BAG:
             continue
         assert (name, kind) in known
-        assert name == "/diagnostics" or code(kind) in page
+        assert code(kind) in page
 
 
 def test_every_declared_parameter_is_that_of_a_node(nodes: list[RigNode]) -> None:
@@ -81,6 +91,17 @@ def test_every_part_and_message_of_diagnostics_is_listed(nodes: list[RigNode]) -
     )
     compared = 4  # comparisons `is Level.ERROR`, `>= Level.WARN`, `== ...` without a text
     assert words - compared <= len(found) <= words
+
+
+def test_the_rows_of_nodes_that_are_no_components_are_in_their_code() -> None:
+    for node in NOT_COMPONENTS:
+        source = inspect.getsource(node.module)
+        offered = {
+            f"{node.name}/{name}" for name in re.findall(r'create_service\(.*"~/(\w+)"', source)
+        }
+        assert {end.name for end, _ in node.endpoints(SERVES)} == offered
+        for part, keys in node.parts.items():
+            assert all(f'"{word}"' in source for word in (part, *keys))
 
 
 def test_every_command_line_is_listed(nodes: list[RigNode]) -> None:

@@ -12,8 +12,8 @@ import link_benchmark
 import recording_benchmark
 import study_benchmark
 import tracker_benchmark
+from child_processes import ending_descendants
 from figure_rows import Row
-from needle_bringup.workplace import ending_descendants
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError

@@ -15,9 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from campaign.trials.recording_trials import record_full_rate
 from figure_rows import Row
-from needle_bags.format.bag_writer import BagWriter
+from needle_bags.format.bag_writer import BagWriter, standard_topic
 from needle_bags.recording.recording import reuse_freed_memory
-from needle_core.files.bag_topic import BagTopic
 
 EXPOSURES = 150
 SECONDS = 20.0
@@ -73,17 +72,7 @@ def _timed(
 
 def _record(path: Path, messages: Iterator[Message]) -> None:
     bag = BagWriter(path)
-    topics = [
-        bag.add_topic(
-            BagTopic(
-                name,
-                kind,
-                _STORE.generate_msgdef(kind, ros_version=2)[0],
-                _STORE.hash_rihs01(kind),
-            )
-        )
-        for name, kind in _TOPICS
-    ]
+    topics = [bag.add_topic(standard_topic(name, kind)) for name, kind in _TOPICS]
     for topic, time_ns, data in messages:
         bag.write(topics[topic], data, time_ns, time_ns)
     bag.close()

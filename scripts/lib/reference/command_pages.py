@@ -48,17 +48,9 @@ def help_of_script(name: str) -> str:
         return help_of_module(module[1], name)
     file = re.search(r'^run python "\$here/lib/(\S+)\.py" "\$@"$', text, re.MULTILINE)
     if file:
-        extras = {extra: mock.MagicMock() for extra in ("onnx", "torch", "torch.nn")}
         folder = str((SCRIPTS / "lib" / file[1]).parent)
-        path = mock.patch.object(sys, "path", [folder, *sys.path])
-        with path, mock.patch.dict(sys.modules, extras):
-            text = help_of_module(file[1].rpartition("/")[2], name)
-            imported = dict(sys.modules)
-        # patch.dict removes all new modules; restore those that do not use the replaced extras.
-        for key, value in imported.items():
-            if key not in extras and not str(getattr(value, "__file__", "")).startswith(folder):
-                sys.modules.setdefault(key, value)
-        return text
+        with mock.patch.object(sys, "path", [folder, *sys.path]):
+            return help_of_module(file[1].rpartition("/")[2], name)
     done = subprocess.run(
         [SCRIPTS / name, "--help"], capture_output=True, text=True, check=True, timeout=60
     )

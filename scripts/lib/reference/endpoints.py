@@ -1,21 +1,17 @@
-"""Topics and services of a constructed node."""
+"""Topics and services of a component."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-
 from code_lines import ROOT
+from needle_core.component import Component, Delivery, Input, Output
+from needle_core.convert import ros_type
 
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
-NAMESPACE = "/of_the_reference"
-"""Namespace of the constructed nodes; names outside it are absolute."""
 SOURCES = ROOT / "ros2_ws" / "src"
-# Packages with the types of rclpy's own endpoints.
-_RCLPY = ("rcl_interfaces", "type_description_interfaces")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,33 +36,31 @@ class Endpoint:
     qos: str
 
 
-def endpoints_of(node: Node) -> list[Endpoint]:
-    """Return the distinct endpoints of a node, without those that every ROS node has."""
-    found: list[tuple[str, str, type[Any], str]] = [
-        *((PUBLISHES, p.topic_name, p.msg_type, in_words(p.qos_profile)) for p in node.publishers),
-        *(
-            (SUBSCRIBES, s.topic_name, s.msg_type, in_words(s.qos_profile))
-            for s in node.subscriptions
-        ),
-        *((SERVES, s.service_name, s.srv_type, "") for s in node.services),
-        *((CALLS, c.service_name, c.srv_type, "") for c in node.clients),
+def endpoints_of(component: Component) -> Iterator[Endpoint]:
+    """Yield the topics and the offered services of a component."""
+    rows: list[tuple[str, Input | Output]] = [
+        *((PUBLISHES, row) for row in component.outputs),
+        *((SUBSCRIBES, row) for row in component.inputs),
     ]
-    ends = (
-        Endpoint(role, name.removeprefix(f"{NAMESPACE}/"), type_name(kind), qos)
-        for role, name, kind, qos in found
-        if type_name(kind).partition("/")[0] not in _RCLPY
-    )
-    return list(dict.fromkeys(ends))
+    for role, row in rows:
+        yield Endpoint(role, row.topic, _type_name(row.message), in_words(row.delivery))
+    for offered in component.services:
+        yield service(SERVES, offered.name, has_argument=offered.has_argument)
 
 
-def type_name(kind: type) -> str:
-    """Return `package/Type` of a message or service class."""
-    return f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
+def service(role: str, name: str, *, has_argument: bool = False) -> Endpoint:
+    """Return the endpoint of a service."""
+    return Endpoint(role, name, f"std_srvs/{'SetBool' if has_argument else 'Trigger'}", "")
 
 
-def in_words(qos: QoSProfile) -> str:
+def in_words(delivery: Delivery) -> str:
     """Return a quality of service as text: `reliable, 10`, `reliable, latched, 1`."""
-    words = ["reliable" if qos.reliability == ReliabilityPolicy.RELIABLE else "best effort"]
-    if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+    words = ["reliable" if delivery.reliable else "best effort"]
+    if delivery.latched:
         words.append("latched")
-    return ", ".join([*words, str(qos.depth)])
+    return ", ".join([*words, str(delivery.depth)])
+
+
+def _type_name(message: type[Any]) -> str:
+    """Return `package/Type` of a message class."""
+    return ros_type(message).replace("/msg/", "/")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from needle_core.settings.parameter_fields import ParameterSpec, specs
-from reference.endpoints import CALLS, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
+from reference.endpoints import CALLS, PUBLISHES, SERVES, SUBSCRIBES
 from reference.markdown import block, code, node_link, table
 from reference.rig_nodes import RigNode
 
@@ -31,7 +31,6 @@ def node_page(node: RigNode) -> str:
     topics = [
         (end.role, code(end.name), code(end.type_name), end.qos, when)
         for end, when in sorted(ends, key=lambda each: (each[0].role != PUBLISHES, each[0].name))
-        if not _is_of_every_node(end)
     ]
     services = [
         ("serves" if end.role == SERVES else "calls", code(end.name), code(end.type_name), when)
@@ -86,10 +85,6 @@ def _allowed(spec: ParameterSpec) -> str:
     return f"to {upper}" if math.isfinite(spec.upper) else ""
 
 
-def _is_of_every_node(end: Endpoint) -> bool:
-    return end.role == PUBLISHES and end.name == "/diagnostics"
-
-
 def nodes_index(nodes: Sequence[RigNode]) -> str:
     """Return the index of the node pages."""
     rows = [(node_link(node.name), code(node.package), _first_sentence(node)) for node in nodes]
@@ -129,9 +124,8 @@ def _both_ends(nodes: Sequence[RigNode], near: str, far: str, head: Sequence[str
     found: dict[tuple[str, str], dict[str, list[str]]] = {}
     for node in nodes:
         for end, when in node.endpoints(near, far):
-            if not _is_of_every_node(end):
-                sides = found.setdefault((end.name, end.type_name), {near: [], far: []})
-                sides[end.role].append(_at_end(node, end.qos, when))
+            sides = found.setdefault((end.name, end.type_name), {near: [], far: []})
+            sides[end.role].append(_at_end(node, end.qos, when))
     rows = [
         (code(name), code(kind), "<br>".join(ends[near]), "<br>".join(ends[far]))
         for (name, kind), ends in sorted(found.items(), key=lambda each: each[0][0].lstrip("/"))

@@ -1,37 +1,32 @@
-"""Construction of every node of the rig, in each variant with different topics or services."""
+"""Components of all nodes of the rig, in each variant with different topics or services."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib
 import inspect
-import sys
-import tempfile
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from types import ModuleType
 from typing import Any
 from unittest import mock
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
-
 from code_lines import ROOT
-from needle_console.console import CALLS, PAGE
-from needle_console.hold.page_session import Mode, PageHold
-from needle_console.page.page_port import PagePort
-from needle_console.view.advice import Button
-from needle_core.component import Call
+from needle_bags.link.openigtlink import LINK, Listeners
+from needle_bags.ros.player import PlayerParameters
+from needle_bags.ros.recorder import PARAMETERS_OF, RecorderParameters
+from needle_bringup.operator.component import DEVICE_STOP
+from needle_console.console import CALLS as OF_BUTTONS
+from needle_console.console import PAGE, HoldRequest
+from needle_console.hold.page_session import RELEASED
+from needle_console.hold.retraction import RETRACT, STOP_STEERING
+from needle_core.component import Action, Call, Component, Diagnose, Moment, Peers
 from needle_core.convert import from_ros, ros_type
-from needle_core.diagnostics import Diagnostic
 from needle_core.message_types import rclpy_types
-from needle_core.process.ros_domain import reserve_domain_id
-from needle_core.ros import main
-from needle_core.ros.base_node import DiagnosticsPublisher
-from reference.endpoints import NAMESPACE, SOURCES, Endpoint, endpoints_of
+from needle_core.runners.process import Handlers
+from reference.endpoints import CALLS, PUBLISHES, SERVES, SOURCES, Endpoint, endpoints_of, service
 
-BAG = ROOT / "bags" / "regression"
 REGISTRATION = ROOT / "ros2_ws/src/needle_tracker/test/data/registration.yaml"
 IN_EVERY_NODE = {
     "input": "a message or request was rejected; counted by topic",
@@ -39,7 +34,6 @@ IN_EVERY_NODE = {
     "duplicates": "another node publishes on a topic of this node",
 }
 """Diagnostic parts that any node may report, through `needle_core.ros`."""
-_WEB_SERVER = "needle_console.page.web_server"
 
 
 def executables(kind: str) -> Iterator[tuple[str, str, str]]:
@@ -98,155 +92,114 @@ class RigNode:
 
 
 def rig_nodes() -> list[RigNode]:
-    """Construct every node of the rig in all its variants, and run its callbacks."""
-    found = []
-    with reserve_domain_id() as domain:
-        for package, name, module_name in executables("node"):
-            module = importlib.import_module(module_name)
-            variants: dict[str, list[Endpoint]] = {}
-            parts: dict[str, list[str]] = {}
-            for when, arguments in VARIANTS.get(name, {"": ""}).items():
-                parameters, variants[when] = _construct(module, arguments, domain, parts)
-            found.append(RigNode(name, package, module, parameters, variants, parts))
-    return found
+    """Make the component of every node in all its variants, and run its handlers."""
+    found = [*NOT_COMPONENTS]
+    for package, name, module_name in executables("node"):
+        if any(name == node.name for node in NOT_COMPONENTS):
+            continue
+        module = importlib.import_module(module_name)
+        parameters, make = _of_component(module)
+        variants: dict[str, list[Endpoint]] = {}
+        parts: dict[str, list[str]] = {}
+        for when, values in VARIANTS.get(name, {"": {}}).items():
+            component = make(parameters(**values), name)
+            calls = [service(CALLS, called) for called in LATER_CALLS.get(name, ())]
+            for action in _actions(component):
+                match action:
+                    case Call():
+                        calls.append(
+                            service(CALLS, action.service, has_argument=action.request is not None)
+                        )
+                    case Diagnose(part, diagnostic) if part not in IN_EVERY_NODE:
+                        keys = parts.setdefault(part, [])
+                        keys += [key for key in diagnostic.values if key not in keys]
+            variants[when] = list(dict.fromkeys((*endpoints_of(component), *calls)))
+        found.append(RigNode(name, package, module, parameters, variants, parts))
+    return sorted(found, key=lambda node: (node.package, node.name))
 
 
-def _construct(
-    module: ModuleType, arguments: str, domain: int, parts: dict[str, list[str]]
-) -> tuple[type, list[Endpoint]]:
-    """Construct a node and run its callbacks; return its parameters and endpoints.
-
-    The parts of its diagnostics are added to `parts`.
-    """
-    report = DiagnosticsPublisher.set
-
-    def report_and_note(self: Any, part: str, diagnostic: Diagnostic) -> None:
-        if part not in IN_EVERY_NODE:
-            keys = parts.setdefault(part, [])
-            keys += [key for key in diagnostic.values if key not in keys]
-        report(self, part, diagnostic)
-
-    own, _, ros = arguments.partition("--ros-args")
+def _of_component(module: ModuleType) -> tuple[type, Callable[[Any, str], Component]]:
+    """Return the parameters and the factory that the `main` of a node's module runs."""
     with (
-        tempfile.TemporaryDirectory() as scratch,
-        _replaced_web_server(),
-        # Avoid opening a camera.
-        mock.patch("needle_tracker.stereo_camera.open_source"),
-        mock.patch.object(DiagnosticsPublisher, "set", report_and_note),
-    ):
-        made = _made_by_main(module, own.split())
-        ros_arguments = ["--ros-args", "--log-level", "fatal", "-r", f"__ns:={NAMESPACE}"]
-        ros_arguments += ros.format(scratch=scratch).split()
-        options = SignalHandlerOptions.NO
-        rclpy.init(args=ros_arguments, domain_id=domain, signal_handler_options=options)
-        try:
-            node = made.args[0]()
-            try:
-                EXERCISES.get(node.get_name(), _exercise)(node)
-                return made.kwargs["parameters"], endpoints_of(node)
-            finally:
-                getattr(node, "close", lambda: None)()
-                node.destroy_node()
-        finally:
-            rclpy.try_shutdown()
-
-
-@contextlib.contextmanager
-def _replaced_web_server() -> Iterator[None]:
-    """Replace the console's page, which requires NiceGUI."""
-    # mock.patch.dict would remove all modules that are imported in the meantime.
-    before = sys.modules.pop(_WEB_SERVER, None)
-    sys.modules[_WEB_SERVER] = mock.Mock(ServedPagePort=PagePort)
-    yield
-    del sys.modules[_WEB_SERVER]
-    if before is not None:
-        sys.modules[_WEB_SERVER] = before
-
-
-def _made_by_main(module: ModuleType, arguments: list[str]) -> Any:
-    """Return the call of `run_node` that the `main` of a node's module makes."""
-    with (
-        mock.patch.object(main, "run_node", return_value=0) as run,
-        mock.patch.object(module, "run_node", run, create=True),
-        mock.patch.object(sys, "argv", [module.__name__, *arguments]),
+        mock.patch.object(module, "run_component", return_value=0) as run,
         # Treat optional packages as installed, because the page must not depend on them.
         mock.patch("importlib.util.find_spec"),
+        mock.patch.dict("sys.modules", {"needle_console.page.web_server": mock.Mock()}),
     ):
         module.main()
-    return run.call_args
+    _, parameters, make = run.call_args.args
+    return parameters, make
 
 
-def _exercise(node: Any) -> None:
-    """Handle an empty message on every topic, images included, and run every timer."""
-    for row in node.component.inputs:
+def _actions(component: Component) -> Iterator[Action]:
+    """Yield the actions after an empty message on every topic, and of every port and timer."""
+    handlers, at = Handlers(component.outputs), Moment(time.monotonic(), time.time_ns())
+    yield from handlers.run(partial(component.on_peers, Peers.of([component]), at))
+    for row in component.inputs:
         message = from_ros(row.message, rclpy_types().make(ros_type(row.message))())
-        node._handle(lambda row=row, message=message: row.handler(message, node._moment()))
-    for timer in list(node.timers):
-        timer.callback()
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    for _turns in range(5):
-        executor.spin_once(timeout_sec=0.0)
-    executor.shutdown()
-    for row in node.component.inputs:
-        node._listen(row.topic, row.lazy)
+        yield from handlers.run(partial(row.handler, message, at))
+    for port in component.ports:
+        for batch in ARRIVING.get(port.name, ()):
+            yield from handlers.run(partial(port.handler, batch, at))
+    for timer in component.timers:
+        yield from handlers.run(partial(timer.handler, at))
 
 
-def _exercise_console(node: Any) -> None:
-    """Press every button of the page."""
-    page = node._ports[PAGE]
-    page.view("left")
-    for button in Button:
-        if button in CALLS:
-            page.press(button)
-    page.set_hold(PageHold(True, 1.0, Mode.RETRACT))
-    node._handle_arrived()
-    for timer in node.component.timers:
-        node._handle(lambda timer=timer: timer.handler(node._moment()))
-    for service in ("device/retract", "plane_controller/stop"):
-        node._execute(Call(service))
-
-
-def _exercise_player(node: Any) -> None:
-    """Publish the time, but no topic of the bag."""
-    node._topics.clear()
-    node._make_publishers()
-    node.check_graph()
-
-
-def _exercise_recorder(node: Any) -> None:
-    """Publish a report, and unsubscribe from all topics of the graph."""
-    node.report()
-    node.recording.close()
-    node._topics.unsubscribe()
-
-
-EXERCISES: dict[str, Callable[[Any], None]] = {
-    "console": _exercise_console,
-    "player": _exercise_player,
-    "recorder": _exercise_recorder,
+LATER_CALLS = {
+    "console": (STOP_STEERING, RETRACT),
+    "operator": (DEVICE_STOP, STOP_STEERING, RETRACT),
 }
-VARIANTS = {
-    "openigtlink": {"": "--ros-args -p port:=0"},
+"""Calls that depend on buttons and on the answers of other nodes, by node."""
+ARRIVING: Mapping[str, Sequence[tuple[Any, ...]]] = {
+    LINK: ((Listeners(1),),),
+    PAGE: (tuple(OF_BUTTONS), (HoldRequest(RELEASED),)),
+}
+"""Batches that arrive at a port, by its name."""
+VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "operator": {
-        "sources pedal and joystick": "--ros-args -p device:=/dev/null -p key:=48",
-        "source joy": "--ros-args -p source:=joy -p key:=0",
+        "sources pedal and joystick": {"device": "/dev/null", "key": 48},
+        "source joy": {"source": "joy", "key": 0},
     },
-    "player": {"": f"{BAG}", "with `--clock`": f"{BAG} --clock 100"},
-    "recorder": {
-        "": "--ros-args -p bag:={scratch}/bag",
-        "with `snapshot_seconds`": "--ros-args -p bag:={scratch}/bag -p snapshot_seconds:=1.0",
-    },
-    "sim_rig": {
-        f"level {level}": f"--ros-args -p level:={level}" for level in ("tip", "camera", "drive")
-    },
+    "sim_rig": {f"level {level}": {"level": level} for level in ("tip", "camera", "drive")},
     "simulated_operator": {
-        "": "",
-        "with `wait_for_recorder`": "--ros-args -p wait_for_recorder:=true",
+        "": {},
+        "with `wait_for_recorder`": {"wait_for_recorder": True},
     },
     "tracked_tip": {
-        f"source {source}": (f"--ros-args -p registration_file:={REGISTRATION} -p source:={source}")
+        f"source {source}": {"registration_file": str(REGISTRATION), "source": source}
         for source in ("openigtlink_client", "pose", "transform")
     },
 }
-"""Command lines of nodes that need parameters or have several variants, by description."""
+"""Parameters of nodes that need some, or have several variants, by description."""
+_PAUSE = service(SERVES, "player/pause", has_argument=True)
+NOT_COMPONENTS = (
+    RigNode(
+        "recorder",
+        "needle_bags",
+        importlib.import_module("needle_bags.ros.recorder"),
+        RecorderParameters,
+        {"": [], "with `snapshot_seconds`": [service(SERVES, "recorder/snapshot")]},
+        {
+            "bag": [
+                *("bag", "topics", "messages", "messages_waiting", "messages_lost", "size_bytes"),
+                *("in_memory_s", "in_memory_bytes"),
+            ],
+            PARAMETERS_OF: [],
+        },
+    ),
+    RigNode(
+        "player",
+        "needle_bags",
+        importlib.import_module("needle_bags.ros.player"),
+        PlayerParameters,
+        {
+            "": [_PAUSE],
+            "with `--clock`": [
+                _PAUSE,
+                Endpoint(PUBLISHES, "/clock", "rosgraph_msgs/Clock", "reliable, 10"),
+            ],
+        },
+        {"playback": ["bag", "messages"]},
+    ),
+)
+"""Nodes whose topics depend on the graph or a bag."""

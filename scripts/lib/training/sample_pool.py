@@ -30,11 +30,10 @@ KINDS = ("drawn", "traced")
 _TRACED_SHARE = 0.6  # share of path-traced samples in a batch
 _OUTSIDE = BORDER - CONTEXT
 HELD_OUT = 9
-"""Last digit of the numbers of scenes that are for validation only."""
+"""Last digit of the numbers of scenes that are for the report only."""
 _AT_ONCE = 12  # number of scenes for the samples of one file
 _TRACED_PER_DRAWN = 2
-_VALIDATION = 6  # number of validation files of each kind
-_SEED_OF, _UNSEEN = {"drawn": 0, "traced": 1}, 10
+_SEED_OF = {"drawn": 0, "traced": 1}
 _POLL = 5.0  # [s]
 
 
@@ -47,7 +46,6 @@ class Shard:
     known: NDArray[np.bool_]
     shares: NDArray[np.uint8]
     ends: NDArray[np.float64]
-    widths_px: NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,17 +60,11 @@ class Batch:
         Share of the shaft in each pixel, 0 to 1.
     ends : ndarray of float32, shape (n, 2)
         Column and row of the end in each patch [px]; NaN if there is none.
-    widths_px : ndarray, shape (n,)
-        Widths of the needles [px].
-    known : ndarray of bool, shape (n,)
-        Whether there is a background.
     """
 
     inputs: Float
     shares: Float
     ends: Float
-    widths_px: NDArray[np.float64]
-    known: NDArray[np.bool_]
 
 
 def write_shard(path: Path, seed: list[int], draw: Callable[[np.random.Generator], Sample]) -> None:
@@ -100,7 +92,6 @@ def write_shard(path: Path, seed: list[int], draw: Callable[[np.random.Generator
             known=np.array([each.background is not None for each in drawn]),
             shares=np.stack([each.share for each in drawn]),
             ends=np.stack([each.end for each in drawn]),
-            widths_px=np.array([each.width_px for each in drawn]),
         )
     new.replace(path)
 
@@ -176,13 +167,7 @@ def batch_of(chosen: list[tuple[Shard, int]], turns: list[int], mirrors: list[bo
         ends[k] = _turned(shard.ends[i] - BORDER, turn, mirror)
     outside = ~((ends >= 0.0) & (ends <= SIZE - 1.0)).all(axis=1)
     ends[outside] = np.nan
-    return Batch(
-        inputs,
-        shares / np.float32(255.0),
-        ends,
-        np.array([shard.widths_px[i] for shard, i in chosen]),
-        np.array([shard.known[i] for shard, i in chosen]),
-    )
+    return Batch(inputs, shares / np.float32(255.0), ends)
 
 
 def _turned(end: NDArray[np.float64], turn: int, mirror: bool) -> NDArray[np.float64]:
@@ -197,7 +182,7 @@ def _turned(end: NDArray[np.float64], turn: int, mirror: bool) -> NDArray[np.flo
 
 
 def is_held_out(seed: int) -> bool:
-    """Return whether a scene is for validation only."""
+    """Return whether a scene is for the report only."""
     return seed % 10 == HELD_OUT
 
 
@@ -249,28 +234,6 @@ def supply(scenes: Path, folder: Path, most: dict[str, int]) -> None:
                 old.unlink()
         if not known:
             time.sleep(_POLL)
-
-
-def write_validation(scenes: Path, folder: Path) -> None:
-    """Write the missing files of validation samples.
-
-    Parameters
-    ----------
-    scenes : Path
-        Folder of the scenes.
-    folder : Path
-        Output folder.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    held_out = [read_scene(path) for path in scene_paths(scenes, held_out=True)]
-    draws = {"drawn": patch}
-    if held_out:
-        draws["traced"] = partial(traced_patch, scenes=held_out)
-    for kind, draw in draws.items():
-        for number in range(_VALIDATION):
-            path = folder / f"{kind}-{number:05d}.npz"
-            if not path.exists():
-                write_shard(path, [_SEED_OF[kind] + _UNSEEN, number], draw)
 
 
 def _next(folder: Path, kind: str) -> tuple[Path, list[int]]:

@@ -20,6 +20,7 @@ import tempfile
 import time
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 from tqdm import tqdm
@@ -29,20 +30,19 @@ from needle_core.commands.cli import run_command
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.path_traced.tracer import load_mitsuba
 from needle_sim.sequences.boxes import draw_box
-from net_report import report, report_views
+from net_report import report
 from own_scenes import own_scenes
 from sample_pool import (
     SHARD,
     Pool,
     read_scene,
-    read_shard,
     scene_paths,
     supply,
     write_scene,
-    write_validation,
 )
-from training_loop import Plan, new_run, resumed, train
-from training_net import NeedleNet
+
+if TYPE_CHECKING:
+    from training_net import NeedleNet
 
 ROOT = Path(__file__).parents[3]
 TRACKER = ROOT / "ros2_ws/src/needle_tracker"
@@ -186,9 +186,11 @@ def read_arguments() -> argparse.Namespace:
 def main() -> int:
     """Trace, draw, train and report; return the exit code."""
     given = read_arguments()
+    # Import late, because --help needs no torch.
+    from training_loop import Plan, new_run, resumed, train  # noqa: PLC0415
+
     checkpoint = given.folder / "checkpoint.pt"
     scenes, samples = given.folder / "scenes", given.folder / "samples"
-    validation = given.folder / "validation"
     cv2.setNumThreads(1)
     if (given.resume or given.report) and checkpoint.exists():
         run = resumed(checkpoint)
@@ -203,7 +205,7 @@ def main() -> int:
             strict=True,
         ):
             write_scene(path, scene)
-        print_report(run.mean_net, scenes, validation)
+        print_report(run.mean_net, scenes)
     if not given.report:
         most = {"drawn": given.drawn, "traced": given.drawn}
         process = multiprocessing.get_context("spawn").Process(
@@ -219,26 +221,20 @@ def main() -> int:
             process.terminate()
             process.join()
         print(f"written: {given.output}")
-    print_report(run.mean_net, scenes, validation)
+    print_report(run.mean_net, scenes)
     return 0
 
 
-def print_report(net: NeedleNet, scenes: Path, validation: Path) -> None:
-    """Print the figures of a net on held-out scenes.
+def print_report(net: NeedleNet, scenes: Path) -> None:
+    """Print the figures of a net on the held-out scenes in a folder."""
+    from training_net import export  # noqa: PLC0415
 
-    Parameters
-    ----------
-    net : NeedleNet
-        The net.
-    scenes, validation : Path
-        Folders of the scenes and of the validation samples.
-    """
-    write_validation(scenes, validation)
-    for kind in ("traced", "drawn"):
-        shards = [read_shard(path) for path in sorted(validation.glob(f"{kind}-*.npz"))]
-        print(f"{kind} samples that it was not trained on\n{report(net, shards)}\n")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "needle_net.onnx")
+        export(net, path)
+        weights = path.read_bytes()
     held_out = (read_scene(path) for path in scene_paths(scenes, held_out=True))
-    print(f"whole images of such scenes\n{report_views(net, held_out)}")
+    print(f"images of scenes that it was not trained on\n{report(weights, held_out)}")
 
 
 if __name__ == "__main__":

@@ -6,12 +6,13 @@ import dataclasses
 import json
 import math
 import os
+import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from campaign.checking import Finding, at_least, at_most
-from needle_bringup.workplace import ran
+from needle_core.errors import UserError
 from needle_core.files.installed import find_executable
 
 AT_END = "converged_at_end"
@@ -178,7 +179,11 @@ def run(study: Study, folder: Path) -> Figures:
     file = folder / f"{study.key}.json"
     command = [find_executable("needle_sim", "monte_carlo"), "--controller", study.controller]
     command += [*study.options, "--draws", "10", "--seed", SEED, "--json", str(file)]
-    ran(command, environment={**os.environ, **ONE_THREAD}, what=study.key)
+    done = subprocess.run(
+        command, env={**os.environ, **ONE_THREAD}, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise UserError(f"{study.key}: {done.stderr.strip()}")
     return dict(json.loads(file.read_text(encoding="utf-8")))
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from child_processes import ending_descendants, processes_with
 from needle_bringup.simulation.node_graph import NodeProcess, stop, wait_for
-from needle_bringup.workplace import ending_descendants, processes_with
 
 # A child that starts another one in its own session.
 PARENT = """

@@ -256,19 +256,11 @@ def _plan_view(run: Run, frames: Sequence[Frame], axis: int, name: str) -> View:
         buffer = io.BytesIO()
         save(figure, buffer)
         picture = buffer.getvalue()
-        width, height = png_size(picture)
-        corners = np.array([[0.0, 0.0], [1.0, 1.0]])
-        (left, bottom), (right, top) = figure.transFigure.inverted().transform(
-            axes.transAxes.transform(corners)
-        )
-        x_range, y_range = axes.get_xlim(), axes.get_ylim()
+    width, height = png_size(picture)
 
     def pixels(needle: Floats) -> Floats:
-        along = (needle[:, 2] * MM - x_range[0]) / (x_range[1] - x_range[0])
-        up = (needle[:, axis] * MM - y_range[0]) / (y_range[1] - y_range[0])
-        u = (left + along * (right - left)) * width
-        v = (1.0 - bottom - up * (top - bottom)) * height
-        return np.stack([u, v], axis=1)
+        at = axes.transData.transform(needle[:, [2, axis]] * MM) / figure.bbox.size
+        return np.column_stack([at[:, 0] * width, (1.0 - at[:, 1]) * height])
 
     lines = [_pixels(pixels, frame.needle) for frame in frames]
     return View(name, (width, height), [picture], lines)

@@ -24,8 +24,7 @@ emergency stops (device/estop), targets (target_plane, target_point, obstacles) 
 publisher), all topics are; if a rig starts later, the playback ends.
 """
 _EPILOG = """\
-Keys during playback: space pauses and resumes, up and down change the rate by 10 %, right and left
-jump by 5 s. From another terminal:
+To pause, to change the rate or to jump during playback, from another terminal:
   ros2 service call /player/pause std_srvs/srv/SetBool "{data: true}"
   ros2 param set /player rate 0.5
   ros2 param set /player seek 12.5       (seconds after the bag's first message)
@@ -35,7 +34,7 @@ examples:
   ros2 run needle_bags player bags/my_run --rate 0.5 --start 10 --end 20 --loop
   ros2 run needle_bags player bags/my_run --topics needle/tip joint_states --paused
   ros2 run needle_bags player bags/my_run --regex '^/needle/' --exclude-regex pose
-  ros2 run needle_bags player bags/my_run --remap needle/tip:=old/tip
+  ros2 run needle_bags player bags/my_run --ros-args -r /needle/tip:=/old/tip
 
 A recorded /clock is played like any topic; with --clock, the recording time is published instead.
 
@@ -60,8 +59,6 @@ class PlayerOptions:
         Start and end, after the first message of the bag [s].
     topics : TopicChoice
         Topics to play.
-    remaps : dict of str to str
-        Absolute recorded name to absolute published name.
     loop, paused : bool
         Whether to repeat at the end; whether to start paused.
     clock : float or None
@@ -73,7 +70,6 @@ class PlayerOptions:
     start: float = 0.0
     end: float = math.inf
     topics: TopicChoice = dataclasses.field(default_factory=TopicChoice)
-    remaps: dict[str, str] = dataclasses.field(default_factory=dict)
     loop: bool = False
     paused: bool = False
     clock: float | None = None
@@ -108,9 +104,6 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
     parser.add_argument("--topics", nargs="+", default=[], metavar="T", help="only these topics")
     add_regex("--regex", "play topics whose name matches, and those of --topics")
     add_regex("--exclude-regex", "do not play topics whose name matches, except those of --topics")
-    parser.add_argument(
-        "--remap", nargs="+", default=[], metavar="A:=B", help="publish topic A under the name B"
-    )
     parser.add_argument("--loop", action="store_true", help="repeat until Ctrl-C")
     parser.add_argument("--paused", action="store_true", help="start paused")
     parser.add_argument(
@@ -124,23 +117,15 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
     given = vars(parser.parse_args(arguments))
     names = tuple(map(absolute_name, given.pop("topics")))
     topics = TopicChoice(names, given.pop("regex"), given.pop("exclude_regex"))
-    remaps = dict(map(_remap, given.pop("remap")))
-    return PlayerOptions(**given, topics=topics, remaps=remaps)
+    return PlayerOptions(**given, topics=topics)
 
 
 def require_fits(options: PlayerOptions, contents: BagDirectory) -> None:
     """Raise a `UserError` if a topic or the start of the options is not in the bag."""
     known = contents.topics
-    for name in (*options.topics.names, *options.remaps):
+    for name in options.topics.names:
         if name not in known:
             raise UserError(f"{name} is not in {options.bag}; it has {', '.join(known)}")
     seconds = (contents.end - contents.start) / 1e9
     if options.start > seconds:
         raise UserError(f"--start {options.start:g} s: {options.bag} ends at {seconds:.1f} s")
-
-
-def _remap(text: str) -> tuple[str, str]:
-    before, mark, after = text.partition(":=")
-    if not (before and mark and after):
-        raise UserError(f"--remap {text!r} is not of the form A:=B; see --help")
-    return absolute_name(before), absolute_name(after)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Final
 
 REPLAY: Final = "/replay"
@@ -43,26 +42,19 @@ def is_guarded(name: str, type_name: str) -> bool:
     return type_name in _GUARDED_TYPES or name.endswith(_GUARDED_NAMES)
 
 
-def played_name(
-    name: str, type_name: str, remaps: Mapping[str, str], *, beside_rig: bool = False
-) -> str:
+def played_name(name: str, type_name: str, *, beside_rig: bool = False) -> str:
     """Return the name of a recorded topic during playback.
 
     Parameters
     ----------
     name, type_name : str
         Recorded name and type.
-    remaps : mapping
-        Absolute recorded name to absolute requested name.
     beside_rig : bool
         Whether a rig is on the graph; if so, everything is played under `replay/`.
     """
-    requested = remaps.get(name, name)
-    if requested.startswith(f"{REPLAY}/"):
-        return requested
-    if beside_rig or is_guarded(name, type_name) or is_guarded(requested, type_name):
-        return REPLAY + requested
-    return requested
+    if name.startswith(f"{REPLAY}/"):
+        return name
+    return REPLAY + name if beside_rig or is_guarded(name, type_name) else name
 
 
 def marks_a_rig(name: str) -> bool:

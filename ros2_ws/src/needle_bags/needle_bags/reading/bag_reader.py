@@ -124,7 +124,7 @@ class Run:
     run_info, versions : dict
         Description of the run, and versions of its software.
     calibration, commit : str
-        Text of the calibration (from the tracker, or given to the recorder) and commit of the
+        Text of the calibration (from the tracker, or in a copy of a bag) and commit of the
         sources; empty if unknown.
     recording : dict of str to str
         Notes of the recorder or of `recover`: keys of `RECORDING`.

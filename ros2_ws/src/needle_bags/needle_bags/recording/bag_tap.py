@@ -63,7 +63,7 @@ class BagTap:
             first.setdefault(row.topic, row)
         for row in first.values():
             self._writer.add_topic(self._topic(row))
-        texts = {"run_info": json.dumps(run_info), "commit": commit(), "calibration": ""}
+        texts = {"run_info": json.dumps(run_info), "commit": commit()}
         self._writer.add_metadata(RUN_RECORD, texts)
         for key, text in {**texts, "versions": json.dumps(versions())}.items():
             self._writer.set_custom_data(key, text)

@@ -148,11 +148,10 @@ class FieldResult:
 
 @dataclasses.dataclass(frozen=True)
 class TopicResult:
-    """Number of messages of a topic, and stamps [ns] of those that only one side has."""
+    """Number of recorded messages of a topic, and stamps [ns] that only one side has."""
 
     topic: str
     recorded: int
-    today: int
     missing: tuple[int, ...]
     extra: tuple[int, ...]
 
@@ -198,7 +197,6 @@ def compare(recorded: Iterable[Record], today: Iterable[Record]) -> Comparison:
             TopicResult(
                 topic,
                 len(old),
-                len(new),
                 tuple(stamp for stamp, n in old if (stamp, n) not in new),
                 tuple(stamp for stamp, n in new if (stamp, n) not in old),
             )

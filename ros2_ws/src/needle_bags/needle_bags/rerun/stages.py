@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable
-from typing import Any, Protocol
+from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
 
@@ -54,24 +54,27 @@ class Output:
         return bytes(_STORE.serialize_cdr(self.message, self.type_name))
 
 
-class Stage(Protocol):
-    """Part of the rig that turns messages into outputs."""
+class Stage:
+    """Part of the rig that turns messages into outputs.
 
-    @property
-    def topics(self) -> frozenset[str]:
-        """Names of its input topics, relative to the rig's namespace, or absolute."""
-        ...
+    Attributes
+    ----------
+    topics : frozenset of str
+        Names of its input topics, relative to the rig's namespace, or absolute.
+    """
+
+    topics: frozenset[str]
 
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
         """Process a message of a topic, given by relative name; return the outputs."""
-        ...
+        raise NotImplementedError
 
     def finish(self, log_time: int) -> list[Output]:
         """Return the outputs that remain at the end of the bag."""
-        ...
+        return []
 
 
-class BagStage:
+class BagStage(Stage):
     """Stage that runs a component on recorded messages.
 
     Parameters
@@ -92,11 +95,7 @@ class BagStage:
         self._rows = {row.topic: row for row in component.inputs}
         images = [row for row in component.inputs if row.message is Image]
         self._rows |= {f"{row.topic}/compressed": row for row in images}
-
-    @property
-    def topics(self) -> frozenset[str]:
-        """Relative names of its input topics."""
-        return frozenset(self._rows)
+        self.topics = frozenset(self._rows)
 
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
         """Process a message of a topic, given by relative name; return the outputs."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_bags.reading.bag_messages import SentMessage, messages_as_sent
-from needle_bags.rerun.stages import CONVERTER, Output
+from needle_bags.rerun.stages import CONVERTER, Output, Stage
 from needle_bags.ros.parameter_snapshots import plain_value
 from needle_controller.plane_controller import (
     STATUS,
@@ -35,7 +35,7 @@ _LONGER_THAN_ANY_TIMEOUT = 1e6
 _NEVER = Moment(0.0, 0)
 
 
-class ControllerStage:
+class ControllerStage(Stage):
     """Stage that runs the current step protocol, estimator and law on the messages of a bag.
 
     Joints and results are those of the recorded device, whose commands may have differed. A step
@@ -83,11 +83,7 @@ class ControllerStage:
             "needle/controller_status": self._handle_status,
             "/parameter_events": self._handle_parameters,
         }
-
-    @property
-    def topics(self) -> frozenset[str]:
-        """Names of its input topics, relative or absolute."""
-        return frozenset(self._handlers)
+        self.topics = frozenset(self._handlers)
 
     def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
         """Process a message of a topic, given by relative name; return the outputs."""
@@ -99,10 +95,6 @@ class ControllerStage:
             content = CONVERTER.to_ros(action.message)
             outputs.append(Output(action.topic, sent.log_time, action.message.stamp_ns, content))
         return outputs
-
-    def finish(self, log_time: int) -> list[Output]:
-        """Return an empty list, as no outputs remain at the end of a bag."""
-        return []
 
     def _handle_result(self, message: Any, sent_ns: int) -> Actions:
         stamp = to_nanoseconds(message.stamp)

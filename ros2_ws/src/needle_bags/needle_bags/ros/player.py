@@ -19,15 +19,7 @@ from std_srvs.srv import SetBool
 from tqdm import tqdm
 
 from needle_bags.format.message_definitions import message_class, unplayable
-from needle_bags.player.playback import (
-    BACK,
-    FASTER,
-    FORWARD,
-    PAUSE,
-    SLOWER,
-    Keys,
-    PlaybackClock,
-)
+from needle_bags.player.playback import PlaybackClock
 from needle_bags.player.player_options import (
     MAX_RATE,
     MIN_RATE,
@@ -56,10 +48,8 @@ DISCOVERY: Final = 2.0
 MATCHING: Final = 3.0
 CHECK_PERIOD: Final = 0.1
 ACKNOWLEDGED: Final = 5.0
-MAX_TURN: Final = 0.02  # maximum delay of a signal, a key or a service call [s]
+MAX_TURN: Final = 0.02  # maximum delay of a signal or a service call [s]
 _NANOSECONDS: Final = 1_000_000_000
-RATE_STEP: Final = 1.1
-SEEK_STEP: Final = 5 * _NANOSECONDS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,19 +158,17 @@ class Player(WholeNode):
             self.destroy_publisher(sender)
         self._senders = {name: self._publisher(topic) for name, topic in self._topics.items()}
         if self._options.clock is not None:
-            name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", {}, beside_rig=self.beside_rig)
+            name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", beside_rig=self.beside_rig)
             self._senders[CLOCK] = self.create_publisher(Clock, name, RELIABLE)
 
     def _publisher(self, topic: BagTopic) -> Publisher:
-        name = played_name(
-            topic.name, topic.type_name, self._options.remaps, beside_rig=self.beside_rig
-        )
+        name = played_name(topic.name, topic.type_name, beside_rig=self.beside_rig)
         publisher = self.create_publisher(
             message_class(topic.type_name),
             name,
             recorded_offer(topic.type_name, topic.offered_qos),
         )
-        # ROS remappings apply after --remap, so check the final name.
+        # ROS remappings apply to this name, so check the final one.
         final = publisher.topic_name
         if not final.startswith(f"{REPLAY}/") and (
             self.beside_rig
@@ -213,10 +201,6 @@ class Player(WholeNode):
         """Yield the messages to play, in order, from the current start."""
         return self._messages(self._topics, self._begin, self.end + 1)
 
-    def seek(self, time: int) -> None:
-        """Jump to a recording time [ns], limited to the bag."""
-        self.seek_target = min(max(time, self._contents.start), self.end)
-
     def begin(self) -> None:
         """Start at the seek target, or at the beginning."""
         self._begin = self.start if self.seek_target is None else self.seek_target
@@ -224,17 +208,6 @@ class Player(WholeNode):
             self._publish_latched(self._begin)
         self.seek_target = None
         self.clock.restart(self._begin, time.monotonic())
-
-    def press(self, key: str) -> None:
-        """Handle a key pressed in the terminal."""
-        now = time.monotonic()
-        if key == PAUSE:
-            self.pause(not self.clock.is_paused)
-        elif key in (FASTER, SLOWER):
-            rate = self.clock.rate * (RATE_STEP if key == FASTER else 1.0 / RATE_STEP)
-            self.set_parameters([Parameter("rate", value=min(max(rate, MIN_RATE), MAX_RATE))])
-        elif key in (BACK, FORWARD):
-            self.seek(self.clock.time(now) + (SEEK_STEP if key == FORWARD else -SEEK_STEP))
 
     def publish(self, message: SentMessage) -> None:
         """Publish a message."""
@@ -263,10 +236,6 @@ class Player(WholeNode):
         values = {"bag": str(self._options.bag), "messages": str(self.messages)}
         self._diagnostics.set("playback", Diagnostic(Level.OK, state, values))
 
-    def pause(self, paused: bool) -> None:
-        """Pause or continue."""
-        self.clock.pause(paused, time.monotonic())
-
     def finish(self) -> None:
         """Wait until all subscribers have received all messages."""
         timeout = Duration(seconds=ACKNOWLEDGED)
@@ -287,10 +256,11 @@ class Player(WholeNode):
             if change.name == "rate":
                 self.clock.set_rate(change.value, time.monotonic())
             elif change.name == "seek":
-                self.seek(self._contents.start + round(change.value * _NANOSECONDS))
+                time_ns = self._contents.start + round(change.value * _NANOSECONDS)
+                self.seek_target = min(time_ns, self.end)
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
-        self.pause(request.data)
+        self.clock.pause(request.data, time.monotonic())
         response.success = True
         response.message = "paused" if request.data else "playing"
         return response
@@ -304,9 +274,9 @@ def _play(player: Player, loop: bool, end: ShutdownFlag) -> int:
         unit="s",
         disable=None,
         leave=False,
-        bar_format="{desc} {bar} {n:.1f}/{total:.1f} s, space bar and arrows",
+        bar_format="{desc} {bar} {n:.1f}/{total:.1f} s",
     )
-    with bar, Keys() as keys:
+    with bar:
         if not player.prepare(partial(executor.spin_once, 0.05), end):
             return EXIT_DONE
         while True:
@@ -325,8 +295,6 @@ def _play(player: Player, loop: bool, end: ShutdownFlag) -> int:
                 player.check_graph()
                 if end.requested:
                     return EXIT_DONE
-                for key in keys.pressed():
-                    player.press(key)
                 elapsed = player.clock.time(time.monotonic()) - player.start
                 bar.n = min(bar.total, elapsed / _NANOSECONDS)
                 bar.set_description("paused" if player.clock.is_paused else "playing")
@@ -339,10 +307,10 @@ def _play(player: Player, loop: bool, end: ShutdownFlag) -> int:
 def main(args: list[str] | None = None) -> int:
     """Run the player; return the exit code."""
     argv = list(sys.argv if args is None else args)
-    own, ros = _split(argv[1:])
+    ros_from = argv.index("--ros-args") if "--ros-args" in argv else len(argv)
 
     def command() -> int:
-        options = parse_options(own)
+        options = parse_options(argv[1:ros_from])
         contents = read_contents(options.bag)
         require_fits(options, contents)
 
@@ -364,28 +332,11 @@ def main(args: list[str] | None = None) -> int:
             lambda: Player(options, contents),
             help_text="",
             parameters=PlayerParameters,
-            args=[argv[0], *ros],
+            args=[argv[0], *argv[ros_from:]],
             spin=spin,
         )
 
     return run_command(command)
-
-
-def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Return (own arguments, those from `--ros-args` to `--`).
-
-    rclpy would treat the `A:=B` of `--remap` as ROS remappings.
-    """
-    own: list[str] = []
-    ros: list[str] = []
-    inside = False
-    for argument in arguments:
-        inside = (inside or argument == "--ros-args") and argument != "--"
-        if inside:
-            ros.append(argument)
-        elif argument != "--":
-            own.append(argument)
-    return own, ros
 
 
 if __name__ == "__main__":

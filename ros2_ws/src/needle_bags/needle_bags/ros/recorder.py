@@ -36,7 +36,6 @@ from needle_core.errors import UserError
 from needle_core.files.bag_path import recover_hint
 from needle_core.files.bag_topic import BagTopic
 from needle_core.files.mcap_file import RUN_RECORD
-from needle_core.files.yaml_files import read_calibration
 from needle_core.process.shutdown import ShutdownFlag
 from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, WholeNode
 from needle_core.ros.main import run_node
@@ -110,11 +109,6 @@ class RecorderParameters:
         1_000_000,
         2**40,
     )
-    calibration_file: str = fixed_parameter(
-        "",
-        "-",
-        "Calibration to store in the bag; a tracker publishes its own.",
-    )
     run_info: str = fixed_parameter(
         "", "-", "Text about the run to store in the bag: YAML `key: value` lines or JSON."
     )
@@ -164,8 +158,6 @@ class Recorder(WholeNode):
         super().__init__("recorder")
         self._settings = NodeParameters(self, RecorderParameters).values
         bag = self._settings.bag or time.strftime("bag_%Y_%m_%d-%H_%M_%S")
-        file = self._settings.calibration_file
-        calibration = read_calibration(Path(file)) if file else ""
         self._diagnostics = DiagnosticsPublisher(self)
         self._topics = GraphTopics(self, self._settings.choice, self._add_topic, self._receive)
         self._recent = self._settings.recent
@@ -183,7 +175,7 @@ class Recorder(WholeNode):
         )
         self._health = RecorderHealth(self.recording, self.bag)
         try:
-            self._write_provenance(calibration)
+            self._write_provenance()
             self._snapshots = ParameterSnapshots(self, self._store_parameters)
             if self._recent is not None:
                 self.create_service(Trigger, "~/snapshot", self._on_snapshot)
@@ -195,12 +187,11 @@ class Recorder(WholeNode):
             raise
         self.get_logger().info(f"recording into {self.bag}")
 
-    def _write_provenance(self, calibration: str) -> None:
+    def _write_provenance(self) -> None:
         texts = {
             "run_info": self._settings.run_info,
             "versions": json.dumps(versions()),
             "commit": commit(),
-            "calibration": calibration,
         }
         for key, text in texts.items():
             self.recording.set_custom_data(key, text)

@@ -23,7 +23,6 @@ from trajectory_msgs.msg import JointTrajectory
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
-from needle_bags.player.playback import FASTER, FORWARD, PAUSE, Keys
 from needle_bags.ros import player as node
 from needle_core.files.bag_topic import BagTopic
 
@@ -80,7 +79,6 @@ class Scene(PlayedGraph):
         super().__init__(monkeypatch, node)
         self.bag = bag
         self.ended = SimpleNamespace(requested=False)
-        self.pressed: list[str] = []
 
         def run_node(create: Any, *, spin: Any, args: list[str], **_: object) -> int:
             return int(spin(create(), self.ended))
@@ -88,9 +86,6 @@ class Scene(PlayedGraph):
         monkeypatch.setattr(node, "run_node", run_node)
         monkeypatch.setattr(node, "NodeParameters", lambda *_: None)
         monkeypatch.setattr(node, "SingleThreadedExecutor", self.executor)
-        monkeypatch.setattr(
-            Keys, "pressed", lambda _: [self.pressed.pop(0)] if self.pressed else []
-        )
 
     def play(self, options: str = "") -> int:
         return node.main(["player", str(self.bag), *options.split()])
@@ -147,8 +142,8 @@ def test_topics_that_control_a_rig_are_not_played(
 
 def test_part_of_a_bag_under_another_name_at_another_rate(scene: Scene) -> None:
     begin = scene.now
-    options = "--start 2 --end 7 --rate 0.5 --topics numbered --remap numbered:=other --clock 10"
-    assert scene.play(options) == 0
+    scene.remaps = {"/numbered": "/other"}
+    assert scene.play("--start 2 --end 7 --rate 0.5 --topics numbered --clock 10") == 0
     assert scene.numbers("/other") == list(range(2, 8))
     assert scene.offered() == {"/other", "/clock"}
     assert scene.now - begin == pytest.approx(node.DISCOVERY + 10.0, abs=0.2)
@@ -180,10 +175,11 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     scene.when(0, lambda: scene.change(seek=15.0))
     scene.when(15, lambda: scene.change(seek=4.0))
     scene.when(4, lambda: scene.change(seek=4.0))
-    # At 5, jump forward by 5 s. The pause at 11 takes no time of the bag.
-    scene.when(5, lambda: scene.pressed.append(FORWARD))
-    scene.when(11, lambda: scene.pressed.append(PAUSE))
-    scene.when(11, lambda: scene.at(10.0, lambda: scene.pressed.extend([PAUSE, FASTER])))
+    scene.when(5, lambda: scene.change(seek=11.0))
+    # The pause at 11 takes no time of the bag.
+    scene.when(11, lambda: scene.pause(True))
+    scene.when(11, lambda: scene.at(10.0, lambda: scene.pause(False)))
+    scene.when(12, lambda: scene.change(rate=1.1))
     assert scene.play("--regex ^/n|plane --exclude-regex noisy") == 0
     assert scene.numbers("/numbered") == [0, 15, 4, 4, 5, *range(11, COUNT)]
     assert scene.offered() == {"/numbered", "/plane", "/replay/target_plane"}

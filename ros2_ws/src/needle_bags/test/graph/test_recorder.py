@@ -99,10 +99,8 @@ def scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Scene:
 
 
 def test_the_bag_has_all_messages_and_what_a_rerun_needs(
-    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calibration = tmp_path / "calibration.yaml"
-    calibration.write_text("phantom: {}\n")
     scene.parameters["/source"] = {"gain": 1.5}
     scene.offer("/state", String, LATCHED)
     scene.offer("/numbered", Int32)
@@ -123,7 +121,7 @@ def test_the_bag_has_all_messages_and_what_a_rerun_needs(
         scene.at(0.1, lambda: scene.send("/rig/late", Int32(data=1)))
         scene.at(0.35, lambda: scene.send("/rig/late", Int32(data=2)))
 
-    assert scene.record(act, calibration_file=str(calibration), run_info="seed: 4") == 0
+    assert scene.record(act, run_info="seed: 4") == 0
     assert f"recorded 204 messages of 4 topics into {scene.bag}" in capsys.readouterr().out
     assert scene.numbers("/numbered") == list(range(200))
     assert scene.numbers("/rig/late") == [1, 2]
@@ -132,7 +130,7 @@ def test_the_bag_has_all_messages_and_what_a_rerun_needs(
     assert qos["/state"].durability is QosDurability.TRANSIENT_LOCAL
     assert qos["/rig/late"].reliability is QosReliability.BEST_EFFORT
     custom = contents.custom_data
-    assert (custom["calibration"], custom["run_info"]) == ("phantom: {}\n", "seed: 4")
+    assert custom["run_info"] == "seed: 4"
     assert yaml.safe_load(custom["parameters"])["/source"] == {"ros__parameters": {"gain": 1.5}}
     (change,) = yaml.safe_load(custom["parameter_changes"])
     assert (change["node"], change["name"], change["value"]) == ("/source", "gain", 2.5)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_bags.player.playback import BACK, FASTER, FORWARD, PAUSE, SLOWER, PlaybackClock, keys_in
+from needle_bags.player.playback import PlaybackClock
 from needle_bags.player.player_options import parse_options
 from needle_bags.player.replay_names import is_guarded, marks_a_rig, played_name
 from needle_core.errors import UserError
@@ -37,10 +37,6 @@ def test_a_pause_takes_no_time() -> None:
     assert clock.wait(7 * SECOND, 70.0) == pytest.approx(1.0)
 
 
-def test_arrow_keys_are_decoded() -> None:
-    assert keys_in(" \x1b[A\x1bOBx\x1b[C\x1b[D") == [PAUSE, FASTER, SLOWER, "x", FORWARD, BACK]
-
-
 @pytest.mark.parametrize(
     ("name", "type_name"),
     [
@@ -54,35 +50,29 @@ def test_arrow_keys_are_decoded() -> None:
 )
 def test_topics_that_control_a_rig_are_played_under_replay(name: str, type_name: str) -> None:
     assert is_guarded(name, type_name)
-    assert played_name(name, type_name, {}) == f"/replay{name}"
-    assert played_name(name, type_name, {name: "/mine"}) == "/replay/mine"
-    assert played_name(f"/replay{name}", type_name, {}) == f"/replay{name}"
+    assert played_name(name, type_name) == f"/replay{name}"
+    assert played_name(f"/replay{name}", type_name) == f"/replay{name}"
 
 
-def test_other_topics_keep_their_names_unless_the_new_one_controls_a_rig() -> None:
+def test_other_topics_keep_their_names_unless_a_rig_runs() -> None:
     for name in ("/needle/tip", "/joint_states", "/clock", "/my_target_plane"):
-        assert played_name(name, POINT, {}) == name
-        assert played_name(name, POINT, {}, beside_rig=True) == f"/replay{name}"
-    remaps = {"/needle/pose": "/target_plane", "/flag": "/device/estop"}
-    for name, requested in remaps.items():
-        assert played_name(name, POINT, remaps) == f"/replay{requested}"
+        assert played_name(name, POINT) == name
+        assert played_name(name, POINT, beside_rig=True) == f"/replay{name}"
     assert marks_a_rig("/bench/device/status")
     assert not marks_a_rig("/replay/device/status")
 
 
 def test_options() -> None:
-    line = "bag --rate 0.5 --start 1 --end 2 --topics needle/tip /clock --remap a:=/b --loop"
+    line = "bag --rate 0.5 --start 1 --end 2 --topics needle/tip /clock --loop"
     options = parse_options(line.split())
     assert (options.bag, options.loop, options.clock) == (Path("bag"), True, None)
     assert options.topics.names == ("/needle/tip", "/clock")
-    assert options.remaps == {"/a": "/b"}
     assert parse_options(["bag", "--clock"]).clock == 40.0
     for arguments, words in {
         "": "required: BAG",
         "bag --rate 0": "rate = 0 is outside",
         "bag --rate nan": "rate = nan",
         "bag --start 3 --end 3": "--end 3 s is not after --start 3 s",
-        "bag --remap a:b": "not of the form A:=B",
         "bag --speed 2": "unrecognized arguments: --speed 2",
         "bag --clock 0": "--clock = 0 Hz",
     }.items():

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 
-from needle_bringup.workplace import checkout, ending_descendants, make_folder, temporary_folder
+from needle_bringup.workplace import checkout, make_folder
 from needle_core.commands.cli import EXIT_DONE, run_command, write_json
 from needle_core.commands.options import CommandParser, output_file, whole_number
 
@@ -37,7 +38,6 @@ def _paper(arguments: Sequence[str]) -> int:
     parser = CommandParser("paper", DESCRIPTION, EPILOG)
     parser.add_argument("--quick", action="store_true", help="fewer trials and runs")
     parser.add_argument("--out", metavar="DIR", help=f"output folder (default: {OUT}/)")
-    parser.add_argument("--runs", metavar="DIR", help="keep and reuse bags and studies here")
     parser.add_argument(
         "--seed", default="1", metavar="N", help="seed of all random numbers (default: 1)"
     )
@@ -46,8 +46,7 @@ def _paper(arguments: Sequence[str]) -> int:
     # The trials use consecutive seeds from this one on.
     seed = whole_number("--seed", given.seed, 0, 2**31 - 100)
     file = output_file("--json", given.json)
-    root = checkout()
-    out = make_folder("--out", given.out or str(root / OUT))
+    out = make_folder("--out", given.out or str(checkout() / OUT))
     make_folder("--out", str(out / IMAGES))
     # Import late, because this takes a second and the command line may be invalid.
     from needle_bags.figures.figure_style import save  # noqa: PLC0415
@@ -55,13 +54,8 @@ def _paper(arguments: Sequence[str]) -> int:
     from needle_bringup.paper.paper_page import as_text, key_figures, page, table  # noqa: PLC0415
     from needle_bringup.paper.paper_results import Laboratory, PaperRuns  # noqa: PLC0415
 
-    runs = given.runs and make_folder("--runs", given.runs)
-    with (
-        contextlib.nullcontext(runs) if runs else temporary_folder() as folder,
-        ending_descendants(),
-    ):
-        laboratory = Laboratory([str(root / "scripts" / "simulate")], folder)
-        results = PaperRuns(laboratory, seed, quick=given.quick)
+    with tempfile.TemporaryDirectory() as folder:
+        results = PaperRuns(Laboratory(Path(folder)), seed, quick=given.quick)
     for name, figure in figures_of(results).items():
         save(figure, out / IMAGES / f"{name}.png")
     (out / PAGE).write_text(page(results), encoding="utf-8")

@@ -1,14 +1,12 @@
-"""Trials and studies of [KC09] section IV, run as commands, and their results."""
+"""Trials and studies of [KC09] section IV, and their results."""
 
 from __future__ import annotations
 
 import contextlib
-import csv
 import dataclasses
-import json
-import shutil
+import io
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +14,13 @@ import numpy.typing as npt
 
 from needle_bags.reading.bag_reader import Run, Series, read_run
 from needle_bags.run.run_summary import reduced_states, target_offset
+from needle_bringup.simulation import simulate_options
+from needle_bringup.simulation.simulate import simulate
+from needle_bringup.studies import monte_carlo_options
 from needle_bringup.studies.pure_insertions import ARC, curvature_errors
-from needle_bringup.workplace import ran
-from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue
-from needle_core.files.installed import find_executable
+from needle_bringup.studies.study_parts import parts_of, results_of
+from needle_controller.curvature import identify_curvature
+from needle_core.commands.cli import JsonValue
 
 Floats = npt.NDArray[np.float64]
 Columns = Mapping[str, Floats]
@@ -37,72 +38,45 @@ DOMAIN_X_MM = 20.0
 DOMAIN_PITCH_DEG = 40.0
 DOMAIN_ROLL_DEG = 90.0
 GOAL_MM = 1.0
-_SUMMARY = "summary.json"
 
 
 class Laboratory:
-    """Runner of trials and studies that runs each of them once.
+    """Runner of trials and studies, in this process.
 
     Parameters
     ----------
-    simulate : sequence of str
-        Command of a trial.
     folder : Path
-        Folder for the results; existing ones are reused.
+        Folder for the bags of the trials.
     """
 
-    def __init__(self, simulate: Sequence[str], folder: Path) -> None:
-        self._simulate = list(simulate)
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def trial(self, name: str, *arguments: str) -> Run:
-        """Run a trial and read its bag; missing the plane is not an error.
+        """Run a trial with the arguments of `simulate`, and read its bag.
 
         Raises
         ------
         UserError
-            If it fails.
+            If it fails; missing the plane is not an error.
         """
+        print(f"running {name} ...", file=sys.stderr, flush=True)
         bag = self._folder / name
-        if not (bag / _SUMMARY).is_file():
-            shutil.rmtree(bag, ignore_errors=True)  # left by a failed run
-            command = [*self._simulate, *arguments, "--bag", str(bag)]
-            _run(name, command, (EXIT_DONE, EXIT_MISSED))
+        with contextlib.redirect_stdout(io.StringIO()):
+            simulate(simulate_options.parse([*arguments, "--bag", str(bag)]))
         return read_run(bag)
 
     def study(self, name: str, *arguments: str) -> tuple[dict[str, JsonValue], Columns]:
-        """Run a Monte Carlo study; return its figures, and the numeric columns of its runs.
+        """Run a study with the arguments of `monte_carlo`; return its figures and its runs."""
+        print(f"running {name} ...", file=sys.stderr, flush=True)
+        parts = parts_of(monte_carlo_options.parse(arguments))
+        results = results_of(parts, [part.run() for part in parts])
+        return dict(results.figures), results.columns
 
-        Raises
-        ------
-        UserError
-            If it fails.
-        """
-        runs = self._folder / f"{name}.csv"
-        words = [*arguments, "--csv", str(runs)]
-        figures = self._figures(name, find_executable("needle_sim", "monte_carlo"), *words)
-        with runs.open(encoding="utf-8", newline="") as stream:
-            reader = csv.reader(stream)
-            head = next(reader)
-            columns = dict(zip(head, zip(*reader, strict=True), strict=True))
-        return figures, _numbers(columns)
-
-    def identify(self, name: str, bag: str, *arguments: str) -> dict[str, JsonValue]:
-        """Identify the curvature in the bag of a trial; return the figures.
-
-        Raises
-        ------
-        UserError
-            If it fails.
-        """
-        command = find_executable("needle_controller", "identify_curvature")
-        return self._figures(name, command, str(self._folder / bag), *arguments)
-
-    def _figures(self, name: str, *command: str) -> dict[str, JsonValue]:
-        file = self._folder / f"{name}.json"
-        if not file.is_file():
-            _run(name, [*command, "--json", str(file)], (EXIT_DONE,))
-        return dict(json.loads(file.read_text("utf-8")))
+    def identify(self, trial: str, *arguments: str) -> dict[str, JsonValue]:
+        """Return the figures of `identify_curvature` for the bag of a trial."""
+        options = identify_curvature.parse([str(self._folder / trial), *arguments])
+        return identify_curvature.summary(*identify_curvature.identify(options))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,7 +180,7 @@ class PaperRuns:
         self.start, _ = study("start", *at, f"--initial={INITIAL}", "--noise-mm", "0.5")
         self.best, _ = study("best", "--controller", "best", "--seed", str(seed), *draws)
         # Skip the first 5 mm, where the needle is not visible and the tracker reports predictions.
-        self.curvature = laboratory.identify("curvature", "pure_insertion", "--from-mm", "5")
+        self.curvature = laboratory.identify("pure_insertion", "--from-mm", "5")
         many = 300 if quick else 3000
         self.curvature_errors = curvature_errors(many, np.random.default_rng(seed))
 
@@ -263,18 +237,3 @@ def _rows(series: Series, stamps: npt.NDArray[np.int64]) -> Floats:
 def _readable(reduced: Floats) -> Floats:
     angles = np.rad2deg(np.unwrap(reduced[:, 1:], axis=0))
     return np.column_stack([reduced[:, 0] * 1e3, angles])
-
-
-def _numbers(columns: Mapping[str, Sequence[str]]) -> Columns:
-    """Return the numeric columns, with NaN for empty cells."""
-    numbers = {}
-    for name, cells in columns.items():
-        with contextlib.suppress(ValueError):
-            numbers[name] = np.array([float(cell) if cell else np.nan for cell in cells])
-    return numbers
-
-
-def _run(name: str, command: Sequence[str], good: Sequence[int]) -> None:
-    print(f"running {name} ...", file=sys.stderr, flush=True)
-    if ran(command, (*good, 130, -2), what=name).returncode in (130, -2):
-        raise KeyboardInterrupt

@@ -31,40 +31,22 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import HoldSession
-from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 HOLD, PROGRESS = "device/hold", "progress"
 RECORDER, PARAMETERS_OF = "recorder", "parameters_of"
 _CONTROLLER, _DEVICE = "needle/controller_status", "device/status"
+HOLD_PERIOD = 0.05
+"""Period of device/hold, which the device requires every 0.1 s [s]."""
 # Number of final release messages, as delivery of the hold is best effort.
 _RELEASES = 3
 
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedOperatorParameters:
-    """Parameters of simulated_operator; SI units."""
+    """Parameters of simulated_operator."""
 
-    speed_scale: float = parameter(
-        1.0,
-        unit="-",
-        lower=0.0,
-        upper=1.0,
-        description="Speed during the hold, relative to the commanded speed.",
-    )
-    hold_rate: float = fixed_parameter(
-        20.0, "Hz", "Rate of device/hold; the device requires at least 10 Hz.", 10.0, 100.0
-    )
-    wait_timeout: float = fixed_parameter(
-        90.0,
-        "s",
-        "Maximum wait for the rig to get ready, and for each service to answer.",
-        0.1,
-        3600.0,
-    )
-    stall_timeout: float = fixed_parameter(
-        30.0, "s", "Release the hold after this time without an advance of the needle.", 0.1, 3600.0
-    )
     wait_for_recorder: bool = fixed_parameter(
         False, "-", "Wait until the recorder has the parameters of all nodes."
     )
@@ -94,9 +76,7 @@ class SimulatedOperator(Component):
         self.name, self.settings = name, settings
         self._unrecorded: Sequence[str] = ("recorder",) if settings.wait_for_recorder else ()
         self._nodes: frozenset[str] = frozenset()
-        self._sequence = OperatorSequence(
-            now, self.name, wait_timeout=settings.wait_timeout, stall_timeout=settings.stall_timeout
-        )
+        self._sequence = OperatorSequence(now, self.name)
         self._session = HoldSession(name)
         self._pending: Call | None = None
         self._is_finished = False
@@ -108,7 +88,7 @@ class SimulatedOperator(Component):
         if settings.wait_for_recorder:
             self.inputs += (Input("/diagnostics", m.Diagnostics, self._on_health),)
         self.outputs = (Output(HOLD, m.HoldState, BEST_EFFORT),)
-        self.timers = (Timer(1.0 / settings.hold_rate, self._on_timer),)
+        self.timers = (Timer(HOLD_PERIOD, self._on_timer),)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Update the list of missing nodes and services."""
@@ -198,13 +178,11 @@ class SimulatedOperator(Component):
         yield self._sequence.outcome
 
     def _hold(self, at: Moment, *, pressed: bool) -> Publish:
-        speed = self.settings.speed_scale
-        return Publish(HOLD, self._session.next_message(at.stamp_ns, pressed=pressed, speed=speed))
+        return Publish(HOLD, self._session.next_message(at.stamp_ns, pressed=pressed, speed=1.0))
 
     def _report(self) -> Diagnose:
         if self._sequence.steering:
-            again = self._sequence.presses_again
-            message = "the hold is pressed" + (f" (pressed again {again} times)" if again else "")
+            message = "the hold is pressed"
         elif self._sequence.outcome is not None:
             message = "the hold is released"
         else:

@@ -17,6 +17,8 @@ DISABLE = Call("device/enable", False)
 # Prefix of the refusal by a node that has not discovered all partners; the call is repeated.
 NOT_YET = "waiting for"
 RETRY_AFTER = 0.1
+# Time limits of each step of the preparation, and of steering without progress [s].
+WAIT_TIMEOUT, STALL_TIMEOUT = 90.0, 30.0
 # An unanswered call is repeated after this time [s]. An answer can be lost: a server that has not
 # discovered the client yet drops it silently.
 CALL_TIMEOUT = 1.0
@@ -43,17 +45,11 @@ class OperatorSequence:
         Time of the start.
     name : str
         Owner of the hold, as in device/status.
-    wait_timeout : float
-        Time limit for each step of the preparation [s].
-    stall_timeout : float
-        Time limit for steering without progress [s].
     """
 
-    def __init__(self, now: float, name: str, *, wait_timeout: float, stall_timeout: float) -> None:
+    def __init__(self, now: float, name: str) -> None:
         self._name = name
-        self._wait_timeout = wait_timeout
-        self._stall_timeout = stall_timeout
-        self._deadline = now + wait_timeout
+        self._deadline = now + WAIT_TIMEOUT
         self._missing: Sequence[str] = ("everything",)
         self._prepared = 0
         self._pending = False
@@ -73,7 +69,6 @@ class OperatorSequence:
         self._controller = ControllerStatus()
         self._progress_at = now
         self._must_release = False
-        self.presses_again = 0
         self.outcome: Exit | None = None
 
     @property
@@ -141,7 +136,7 @@ class OperatorSequence:
         self._retry_at = now
         self._refusal = ""
         self._refused_since = None
-        self._deadline = now + self._wait_timeout
+        self._deadline = now + WAIT_TIMEOUT
         self._progress_at = now
 
     def handle_devices(self, names: Sequence[str]) -> None:
@@ -167,9 +162,7 @@ class OperatorSequence:
         if self._called(HOME) and self._homed and self._homing_seen:
             self._advance(now)
         # The device requires a release before it accepts the press again.
-        must_release = self.steering and status.press_again == self._name
-        self.presses_again += self._must_release and not must_release
-        self._must_release = must_release
+        self._must_release = self.steering and status.press_again == self._name
         if status.state in ("FAULT", "ESTOPPED") and self._prepared:
             self._end(f"device {status.state}: {status.why or _NO_REASON}")
 
@@ -211,14 +204,12 @@ class OperatorSequence:
             return
         if self._prepared < len(PREPARATION):
             if now >= self._deadline:
-                self._end(
-                    f"the rig is not ready after {self._wait_timeout:g} s: {self.pending_reason()}"
-                )
-        elif now >= self._progress_at + self._stall_timeout:
+                self._end(f"the rig is not ready after {WAIT_TIMEOUT:g} s: {self.pending_reason()}")
+        elif now >= self._progress_at + STALL_TIMEOUT:
             status = self._controller
             waits = status.state == "WAITING_FOR_TIP" and status.reason
             self._end(
-                f"no progress for {self._stall_timeout:g} s at {status.insertion_m * 1e3:.1f} mm "
+                f"no progress for {STALL_TIMEOUT:g} s at {status.insertion_m * 1e3:.1f} mm "
                 f"(plane_controller is {status.state or 'silent'}{f': {waits}' if waits else ''})"
             )
 

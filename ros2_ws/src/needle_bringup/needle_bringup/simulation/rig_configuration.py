@@ -42,29 +42,8 @@ CONTINUOUS_CAMERA_RATE = 30.0
 # Minimum noise bound assumed by the controllers [m].
 SMALLEST_NOISE = 1e-5
 
-# Parameter that `simulate` sets -> its option.
-_ALIKE = ("level", "seed", "bag", "estimator", "law", "planner", "insertion", "obstacles")
-OPTIONS = {
-    **{name: f"--{name}" for name in _ALIKE},
-    **dict.fromkeys(("initial_pitch", "initial_roll", "target_offset"), "--initial"),
-    **dict.fromkeys(("tip_noise", "tip_covariance", "tip_noise_bound"), "--noise-mm"),
-    **dict.fromkeys(("needle_diameter", "needle_width"), "--diameter-mm"),
-    **dict.fromkeys(("pre_bend", "pre_bend_lean", "tip_lean"), "--pre-bend-deg"),
-    **dict.fromkeys(("curvature", "max_curvature"), "--curvature"),
-    "torsion_play": "--play-deg",
-    "torsion_lag": "--lag-mm",
-    "measurement_std": "--noise-mm",
-    "preset": "--controller",
-    "depth": "--depth-mm",
-    "target_point": "--target",
-}
-
 # Watchdog time of driver and drives when seven processes share the cores [s].
 GRAPH_WATCHDOG = 0.5
-
-# Parameters of the recorder that make the bag incomplete.
-_CHOICES = ("topics", "regex", "exclude_regex", "snapshot_seconds")
-
 
 CURVATURE, DIAMETER, PRE_BEND, LEAN = 1.0 / 0.122, 0.7e-3, math.radians(10.0), math.radians(5.6)
 """The needle of [KC09], every node's default: curvature [1/m], diameter [m], bend, lean [rad]."""
@@ -239,19 +218,14 @@ def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> 
     Raises
     ------
     UserError
-        If the file sets a parameter that an option sets, or makes the recording incomplete.
+        If the file sets a parameter that the command line sets.
     """
     reserved = command_line_parameters(options, Path())
     for node, values in given.items():
-        for name in values:
-            if name in reserved[node]:
-                option = OPTIONS.get(name)
-                hint = f"use {option}" if option else "simulate sets it itself"
-                raise UserError(f"{path}: {node}: {name} cannot be in the file, {hint}")
-    chosen = [name for name in given.get("recorder", {}) if name in _CHOICES]
-    if chosen:
-        why = "simulate waits for a recorder of everything and reports the whole run"
-        raise UserError(f"{path}: recorder: {chosen[0]} cannot be in the file: {why}")
+        for name in reserved[node].keys() & values.keys():
+            raise UserError(
+                f"{path}: {node}: {name} cannot be in the file: simulate sets it by its options"
+            )
 
 
 def run_info(options: SimulateOptions) -> dict[str, Any]:

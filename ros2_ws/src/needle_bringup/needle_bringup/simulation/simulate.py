@@ -203,22 +203,14 @@ def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
         value = summary.get(key)
         return f"{value:.{digits}f}" if isinstance(value, (int, float)) else "-"
 
-    if summary.get("reached_depth"):
-        verdict = "CONVERGED" if summary.get("converged") else "MISSED"
-        away = f"{figure('r1_final_mm')} mm from the plane"
-        if summary.get("point_error_mm") is not None:
-            away = f"{figure('point_error_mm')} mm from the point"
-        head = [f"{verdict}: the tip ends {away} (goal: within 1 mm)"]
-    else:
-        reason = summary.get("reason") or "no reason given"
-        head = [
-            f"NOT FINISHED: stopped at {figure('insertion_final_mm', 1)} mm: {reason}",
-            f"  r1 there          {figure('r1_final_mm')} mm",
-        ]
+    # Import late, because it takes a second.
+    from needle_bags.report.pages import verdict_text  # noqa: PLC0415
+
+    verdict, sentence = verdict_text(summary)
     in_plane = f"  r1, last 20 mm    {figure('r1_rms_last_20_mm')} mm rms"
     lines = [
-        *head,
-        f"  depth             {figure('insertion_final_mm', 1)} mm in {summary.get('steps')} steps",
+        f"{verdict.upper()}: {sentence}",
+        f"  steps             {summary.get('steps')}",
         *([in_plane] if summary.get("point_error_mm") is None else ()),
         f"  tip error         {figure('tip_error_p95_mm')} mm, of which in depth "
         f"{figure('depth_error_p95_mm')} mm (95th percentile)",

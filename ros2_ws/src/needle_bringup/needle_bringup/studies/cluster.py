@@ -7,6 +7,7 @@ steers the same few needles, to detect processors that round differently.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import functools
 import hashlib
@@ -46,8 +47,6 @@ def on_cluster(
 ) -> Iterator[Result]:
     """Yield the results of `work` on each part, in the order of the parts.
 
-    A lost connection is restored, to compute the parts that are still missing.
-
     Parameters
     ----------
     address : str
@@ -78,39 +77,18 @@ def on_cluster(
     # Disable its log, because it also raises the logged errors.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     run = functools.partial(_run, work, identity(_package_of(work)))
-    # Results that arrived before those of earlier parts.
-    early: dict[int, Result] = {}
-    yielded = 0
-    while yielded < len(parts):
-        missing = [number for number in range(yielded, len(parts)) if number not in early]
-        try:
-            client = distributed.Client(address, timeout=CONNECTS_WITHIN)
-        except OSError as error:
-            raise UserError(f"--scheduler {address}: {_line(error)}") from error
-        with client:
-            remaining = [parts[number] for number in missing]
-            futures = client.map(run, remaining, pure=False, batch_size=100)
-            numbers = {future.key: n for future, n in zip(futures, missing, strict=True)}
-            done = distributed.as_completed(futures)
-            futures.clear()
-            try:
-                for future in done:
-                    early[numbers[future.key]] = future.result()
-                    # Allow the cluster to free the result.
-                    future.release()
-                    while yielded in early:
-                        yield early.pop(yielded)
-                        yielded += 1
-            except distributed.KilledWorker as error:
-                raise UserError(
-                    f"--scheduler {address}: {_line(error)} (out of memory? see their logs)"
-                ) from error
-            except (OSError, distributed.CancelledError) as error:
-                # The scheduler drops the tasks of a lost connection.
-                if yielded + len(early) == len(parts) - len(missing):
-                    raise UserError(
-                        f"--scheduler {address}: lost, with {yielded} of {len(parts)} parts done"
-                    ) from error
+    try:
+        with distributed.Client(address, timeout=CONNECTS_WITHIN) as client:
+            futures = collections.deque(client.map(run, parts, pure=False, batch_size=100))
+            while futures:
+                # Without its future, the cluster frees the result.
+                yield futures.popleft().result()
+    except distributed.KilledWorker as error:
+        raise UserError(
+            f"--scheduler {address}: {_line(error)} (out of memory? see their logs)"
+        ) from error
+    except (OSError, distributed.CancelledError) as error:
+        raise UserError(f"--scheduler {address}: {_line(error)}") from error
 
 
 @functools.lru_cache(maxsize=1)

@@ -61,7 +61,7 @@ def patch(rng: np.random.Generator) -> Sample:
     if there:
         share = np.rint(255.0 * true_map(pose, CANVAS)).astype(np.uint8)
         end = np.array([pose.x, pose.y])
-    return Sample(photo, background, share, end, width)
+    return Sample(photo, background, share, end)
 
 
 def _alike(rng: np.random.Generator, image: Image, before: Image) -> tuple[Image, Image]:

@@ -45,15 +45,12 @@ class Sample:
         255 times the share of each pixel that belongs to the shaft, cut straight at its end.
     end : ndarray, shape (2,)
         Column and row of the end [px]; NaN if there is none.
-    width_px : float
-        Width of the needle [px], also given if there is no needle.
     """
 
     image: NDArray[np.uint8]
     background: NDArray[np.uint8] | None
     share: NDArray[np.uint8]
     end: NDArray[np.float64]
-    width_px: float
 
 
 def random_width(rng: np.random.Generator) -> float:

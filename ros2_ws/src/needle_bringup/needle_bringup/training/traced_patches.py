@@ -101,7 +101,7 @@ def traced_patch(rng: np.random.Generator, scenes: Sequence[TracedScene]) -> Sam
         if scale < _LARGEST:
             break
     else:
-        scale, width = _LARGEST, _LARGEST * float(scene.widths_px[i])
+        scale = _LARGEST
     place = _place(rng, scene, i) + rng.uniform(-_BESIDE_PX, _BESIDE_PX, 2) / scale
     cut = Cut(place, scale, float(rng.uniform(0.0, 2.0 * np.pi)))
     image, share = cut.image(scene.images[i]), cut.image(scene.shares[i])
@@ -115,7 +115,7 @@ def traced_patch(rng: np.random.Generator, scenes: Sequence[TracedScene]) -> Sam
         before = None if before is None else before * shifted_tracks(rng, tracks)
     seen, background = exposed(rng, image, before)
     end = cut.point(scene.ends[i])
-    return Sample(seen, background, np.rint(share).astype(np.uint8), end, width)
+    return Sample(seen, background, np.rint(share).astype(np.uint8), end)
 
 
 def _earlier(rng: np.random.Generator, i: int, count: int) -> int:

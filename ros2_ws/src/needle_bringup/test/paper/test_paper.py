@@ -23,6 +23,7 @@ from needle_bringup.paper.paper_results import (
     missed_later,
     settled_mm,
 )
+from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_bringup.workplace import checkout
 from needle_core.commands.cli import JsonValue
 from needle_core.errors import UserError
@@ -71,33 +72,14 @@ def test_trials_are_averaged_over_their_common_range() -> None:
     np.testing.assert_allclose(shares, [[0.5, np.nan], [np.nan, 1.0]])
 
 
-def test_existing_results_are_reused(tmp_path: Path) -> None:
-    (tmp_path / "one.json").write_text(json.dumps({"runs": 2}), "utf-8")
-    (tmp_path / "one.csv").write_text("x_mm,controller,settle_mm\n1,best,2\n3,best,\n", "utf-8")
-    laboratory = Laboratory(["/nowhere"], tmp_path)
-    figures, runs = laboratory.study("one", "--frobnicate")
-    assert figures == laboratory.identify("one", "bag") == {"runs": 2}
-    np.testing.assert_array_equal(runs["x_mm"], [1.0, 3.0])
-    np.testing.assert_array_equal(runs["settle_mm"], [2.0, np.nan])
-    assert set(runs) == {"x_mm", "settle_mm"}
-
-
-def test_runs_are_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[list[str]] = []
-    monkeypatch.setattr(paper_results, "_run", lambda name, command, good: asked.append(command))
-    laboratory = Laboratory(["simulate", "-q"], tmp_path)
-    for work, words in (
-        (laboratory.trial, ("one", "--level", "tip")),
-        (laboratory.study, ("two", "--draws", "1")),
-        (laboratory.identify, ("three", "one", "--from-mm", "5")),
-    ):
-        # Without runs there are no results to read.
-        with pytest.raises((FileNotFoundError, UserError)):
-            work(*words)
-    bag = str(tmp_path / "one")
-    assert asked[0] == ["simulate", "-q", "--level", "tip", "--bag", bag]
-    assert [Path(command[0]).name for command in asked[1:]] == ["monte_carlo", "identify_curvature"]
-    assert (asked[1][1:3], asked[2][1:4]) == (["--draws", "1"], [bag, "--from-mm", "5"])
+def test_a_trial_is_a_simulation_with_a_bag_in_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[SimulateOptions] = []
+    monkeypatch.setattr(paper_results, "simulate", asked.append)
+    with pytest.raises(UserError, match="no such bag"):
+        Laboratory(tmp_path).trial("one", "--level", "tip")
+    assert (asked[0].level, asked[0].bag) == ("tip", tmp_path / "one")
 
 
 def test_bad_arguments_give_a_one_line_error_and_exit_2(
@@ -138,7 +120,7 @@ class MadeUpLaboratory(Laboratory):
         columns["r1_final_mm"][0] = -2.0
         return FIGURES, columns
 
-    def identify(self, name: str, bag: str, *arguments: str) -> dict[str, JsonValue]:
+    def identify(self, trial: str, *arguments: str) -> dict[str, JsonValue]:
         return {"radius_mm": 121.0, "radius_low_mm": 118.5, "radius_high_mm": 124.5}
 
 

@@ -37,7 +37,7 @@ def on_controller(sequence: OperatorSequence, now: float = 2.0, **changes: Any) 
 
 def without_status() -> OperatorSequence:
     """Return a sequence that has received no status and misses no partner."""
-    sequence = OperatorSequence(0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0)
+    sequence = OperatorSequence(0.0, "simulated_operator")
     sequence.handle_missing([])
     return sequence
 
@@ -84,9 +84,9 @@ def test_it_calls_nothing_while_a_partner_is_missing() -> None:
     sequence = with_device()
     sequence.handle_missing(["service device/home"])
     assert sequence.next_call(1.0) is None
-    sequence.check_time(29.9)
+    sequence.check_time(89.9)
     assert outcome(sequence) is None
-    sequence.check_time(30.0)
+    sequence.check_time(90.0)
     assert "service device/home" in why(sequence)
     assert not sequence.touched
 
@@ -106,7 +106,7 @@ def test_it_repeats_calls_until_the_rig_is_ready_or_refuses() -> None:
 
 def test_a_service_that_never_answers_is_named() -> None:
     sequence = reach(CONFIRM)
-    sequence.check_time(31.0)
+    sequence.check_time(91.0)
     assert "no answer from device/confirm_needle_out" in why(sequence)
 
 
@@ -228,11 +228,11 @@ def test_a_start_that_ends_immediately_fails_the_run() -> None:
 def test_no_progress_releases_the_hold() -> None:
     sequence = reach()
     on_controller(sequence, 10.0)
-    on_controller(sequence, 60.0)
-    sequence.check_time(69.9)
+    on_controller(sequence, 30.0)
+    sequence.check_time(39.9)
     assert outcome(sequence) is None
-    sequence.check_time(70.0)
-    assert "no progress for 60 s at 3.0 mm" in why(sequence)
+    sequence.check_time(40.0)
+    assert "no progress for 30 s at 3.0 mm" in why(sequence)
 
 
 def test_an_ignored_press_is_released_and_repeated() -> None:
@@ -244,12 +244,10 @@ def test_an_ignored_press_is_released_and_repeated() -> None:
         assert not sequence.hold()
         on_device(sequence, HOLDING, 9.1)
         assert sequence.hold(), "the device has heard the release"
-        assert sequence.presses_again == 1
         # On a busy machine statuses arrive late: a step may be under way without one.
         on_device(sequence, dataclasses.replace(HOLDING, press_again="somebody"), 9.2)
-        sequence.check_time(50.0)
+        sequence.check_time(30.0)
         assert sequence.hold()
-        assert sequence.presses_again == 1
 
 
 def test_a_real_device_ends_the_run() -> None:
@@ -270,7 +268,7 @@ def test_it_acts_only_on_a_single_simulated_device() -> None:
     sequence.handle_devices(["/sim_rig", "/device_driver"])
     assert sequence.next_call(1.0) is None
     assert outcome(sequence) is None, "one that was killed counts for a while"
-    sequence.check_time(30.0)
+    sequence.check_time(90.0)
     assert "/sim_rig, /device_driver" in why(sequence)
 
 

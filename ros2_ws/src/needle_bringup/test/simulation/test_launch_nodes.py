@@ -42,7 +42,7 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").touch()
     bag, typo = str(tmp_path), str(tmp_path / "typo.yaml")
     emulator = file_of(tmp_path, "drive_emulator", channel="x")
-    operator = file_of(tmp_path, "simulated_operator", stall_timeout=1.0)
+    operator = file_of(tmp_path, "simulated_operator", wait_for_recorder=True)
     for start, arguments, cause in (
         (beside_rig, {"drives": typo}, "drives:=.*typo.yaml: no such file"),
         (beside_rig, {"params": typo}, "params:=.*typo.yaml: no such file"),

@@ -60,9 +60,9 @@ def test_a_run_leaves_bag_report_and_summary(ended: tuple[int, Path]) -> None:
     for name in ("report.html", "parameters.yaml", "metadata.yaml"):
         assert (folder / "bag" / name).is_file()
     lines = simulate.describe(summary, folder / "bag").splitlines()
-    assert lines[0].startswith("CONVERGED: the tip ends ")
+    assert lines[0].startswith("CONVERGED: The tip ended ")
     away = simulate.describe({**summary, "converged": False, "point_error_mm": 2.0}, folder)
-    assert away.startswith("MISSED: the tip ends 2.00 mm from the point")
+    assert away.startswith("MISSED THE POINT: The tip ended 2.00 mm from the point")
     assert "tripped 3 times" in simulate.describe({**summary, "watchdog_trips": 3}, folder)
 
 
@@ -145,7 +145,8 @@ def test_an_unfinished_run_names_its_first_cause(stopped: Run) -> None:
     summary = summarize(stopped)
     assert (summary["converged"], summary["reached_depth"]) == (False, False)
     lines = simulate.describe(summary, Path("bags/run")).splitlines()
-    assert lines[0] == "NOT FINISHED: stopped at 30.0 mm: no tip for 2 s"
+    assert lines[0].startswith("NOT FINISHED: ")
+    assert lines[0].endswith("but stopped at 30 mm: no tip for 2 s.")
     *before, waits, ends = stopped.controller_status
     # A tip that was found again is no cause; an earlier report of device or simulation is one.
     again = dataclasses.replace(before[-1], log_time=waits.log_time + 5)
