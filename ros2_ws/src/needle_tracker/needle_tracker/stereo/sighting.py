@@ -1,24 +1,19 @@
-"""Pairing of the ends in both views: which pairs can be the needle, and the evidence for each.
-
-A shadow on the floor, a cable above the surface or two different lines in the two images may end
-where a needle could, but between the entry and that end they are too deep, too high, or do not
-meet. Therefore, the whole shaft is reconstructed from its paths in both images.
-"""
+"""Pairs of ends in both views: which can be those of the needle, and the evidence for each."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_core.compiled import compiled
 from needle_tracker.detector.end_fit import ImageEnd
-from needle_tracker.detector.end_search import SEARCH, ShaftPath
 from needle_tracker.detector.needle_detector import NeedleDetector
-from needle_tracker.optics.refraction import RefractedCamera, cross, dot, pixel_ray
+from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
+from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.stereo.shaft_search import Shaft, find_shafts
 from needle_tracker.stereo.triangulation import SpatialTip, triangulate
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
@@ -36,36 +31,28 @@ class PairingSettings:
         Squared Mahalanobis distance above which two observations differ: 5 sigma.
     sigmas : float
         Half width of a search region, in standard deviations.
-    path_across_px, path_along_px : float
-        Standard deviations of the end of a path [px]: two lines may merge at half size.
     same_px : float
         Distance below which two ends in one view count as one [px].
     least_chance : float
         Lower limit of the network's probabilities; the upper limit is 1 minus this.
     pre_bend : float
         Largest length of the pre-bend [m].
-    tolerance : float
-        Margin of the reach for a point along the shaft [m].
     point_sigma : float
         Standard deviation of a point along the shaft [m].
     passes : int
         Iterations of the fit of the shaft.
-    least_step : float
-        Least change of the distance between the rays, from one point of a path to the next [m]: a
-        shaft along the baseline of the cameras has no depth.
+    direction_rows : int
+        Number of rows of the search grid that determine the direction of a shaft at its end.
     """
 
     gate: float = 25.0
     sigmas: float = 3.0
-    path_across_px: float = 4.0
-    path_along_px: float = 10.0
     same_px: float = 2.0
     least_chance: float = 0.02
     pre_bend: float = 10e-3
-    tolerance: float = 3e-3
     point_sigma: float = 0.5e-3
     passes: int = 4
-    least_step: float = 1e-5
+    direction_rows: int = 12
 
 
 PAIRING = PairingSettings()
@@ -126,63 +113,49 @@ class StereoSearch:
         pair of (ImageEnd or None)
             The clearest end in the left and the right image, whether or not they meet.
         """
-        found = [each.search(least, most) for each in self.detectors]
-        meeting = self._paths_that_meet(found)
+        grid = make_search_grid(self.views, self.settings)
+        shafts = find_shafts(grid, self.detectors, least, most)
         # The first tip of a short needle may come from the end in one view and the shaft in both.
         hidden = most < 2.0 * self.settings.entry_zone
-        left, right = (
-            [(end, path) for path in own for end in detector.ends_near(path, hidden=hidden)]
-            for detector, own in zip(self.detectors, meeting, strict=True)
+        sightings: list[Sighting] = []
+        for shaft in shafts:
+            points = grid.points(shaft.cells)
+            # Most shafts that are not the needle's have no end in the left image at full size.
+            for left in self._ends(0, grid, shaft, hidden=hidden):
+                for right in self._ends(1, grid, shaft, hidden=hidden):
+                    if all(_differ((left, right), other.ends) for other in sightings):
+                        sightings.extend(self._sightings((left, right), points, least, most))
+        if sightings:
+            sightings.sort(key=lambda sighting: -sighting.evidence)
+            return sightings, sightings[0].ends
+        if not shafts:
+            return [], (None, None)
+        one, other = (
+            max(self._ends(side, grid, shafts[0], hidden=True), key=lambda e: e.ends, default=None)
+            for side in range(2)
         )
-        sightings = [
-            self._sighting((one[0], other[0]), (one[1], other[1]), least, most)
-            for one, other in itertools.product(_distinct(left), _distinct(right))
-        ]
-        sorted_sightings = sorted(filter(None, sightings), key=lambda sighting: -sighting.evidence)
-        if sorted_sightings:
-            return sorted_sightings, sorted_sightings[0].ends
-        alone = (
-            [end for path in own[:1] for end in detector.ends_near(path, hidden=True)]
-            for detector, own in zip(self.detectors, found, strict=True)
-        )
-        one, other = (max(ends, key=lambda end: end.ends, default=None) for ends in alone)
         return [], (one, other)
 
-    def _paths_that_meet(
-        self, paths: list[list[ShaftPath]]
-    ) -> tuple[list[ShaftPath], list[ShaftPath]]:
-        """Return the paths of each view in the best pairs whose ends meet."""
-        pairs = []
-        for pair in itertools.product(*paths):
-            tip = triangulate(self.views, (_coarse_end(pair[0]), _coarse_end(pair[1])))
-            if tip is not None and tip.misfit < PAIRING.gate:
-                pairs.append((pair[0].score + pair[1].score - 0.5 * tip.misfit, pair))
-        pairs.sort(key=lambda scored: -scored[0])
-        # Fit the ends of only half as many pairs as there are candidates at full size.
-        best = [pair for _, pair in pairs[: SEARCH.candidates // 2]]
-        left, right = (list({id(pair[i]): pair[i] for pair in best}.values()) for i in range(2))
-        return left, right
+    def _ends(self, side: int, grid: SearchGrid, shaft: Shaft, *, hidden: bool) -> list[ImageEnd]:
+        """Return the ends near that of a shaft, in the left (0) or the right (1) image."""
+        cells = shaft.cells[-PAIRING.direction_rows :]
+        pixels = grid.views[side].pixels[cells].astype(np.float64)
+        # Means of both halves smooth the steps of the cells.
+        early, late = np.array_split(pixels, 2)
+        ahead = late.mean(axis=0) - early.mean(axis=0)
+        direction = ahead / np.linalg.norm(ahead)
+        return self.detectors[side].ends_near(pixels[-1], direction, hidden=hidden)
 
-    def _sighting(
-        self,
-        ends: tuple[ImageEnd, ImageEnd],
-        paths: tuple[ShaftPath, ShaftPath],
-        least: float,
-        most: float,
-    ) -> Sighting | None:
-        """Return the sighting of two ends; None if they cannot be those of the needle."""
+    def _sightings(
+        self, ends: tuple[ImageEnd, ImageEnd], points: Array, least: float, most: float
+    ) -> Iterator[Sighting]:
+        """Yield the sighting of two ends, if they can be those of the needle."""
         tip = triangulate(self.views, ends)
         if tip is None or tip.misfit > PAIRING.gate or not self.is_possible(tip, least, most):
-            return None
-        # At half size, a needle and its shadow may merge into one line.
-        left, right = (
-            detector.trace(path, end)
-            for detector, path, end in zip(self.detectors, paths, ends, strict=True)
-        )
-        shaft = shaft_points(self.views, (left, right), tip.position)
-        if not is_reachable(shaft, self.settings):
-            return None
-        return Sighting(tip, ends, evidence(ends, tip), shaft_length(shaft))
+            return
+        before = np.linalg.norm(points, axis=1) < np.linalg.norm(tip.position)
+        length = shaft_length(np.vstack([points[before], tip.position]))
+        yield Sighting(tip, ends, evidence(ends, tip), length)
 
     def is_possible(self, tip: SpatialTip, least: float, most: float) -> bool:
         """Return whether position and direction of a tip are possible for the needle."""
@@ -221,117 +194,12 @@ def _log_odds(chance: float) -> float:
     return math.log(chance / (1.0 - chance))
 
 
-def _coarse_end(path: ShaftPath) -> ImageEnd:
-    """Return the end of a path with a coarse uncertainty, for pairing by position."""
-    across, along = PAIRING.path_across_px, PAIRING.path_along_px
-    return ImageEnd(path.end, path.direction, across, along, 0.0, 0.0, path.shaft)
-
-
-def _distinct(ends: list[tuple[ImageEnd, ShaftPath]]) -> list[tuple[ImageEnd, ShaftPath]]:
-    """Return each end once, although several paths may lead to it."""
-    kept: list[tuple[ImageEnd, ShaftPath]] = []
-    for end, path in ends:
-        if all(math.dist(end.point, other.point) > PAIRING.same_px for other, _ in kept):
-            kept.append((end, path))
-    return kept
-
-
-def shaft_points(
-    views: tuple[RefractedCamera, RefractedCamera], paths: tuple[ShaftPath, ShaftPath], tip: Array
-) -> Array:
-    """Return points along the shaft, from the entry to the tip.
-
-    Parameters
-    ----------
-    views : pair of RefractedCamera
-        Left and right.
-    paths : pair of ShaftPath
-        The shaft in the left and the right image.
-    tip : ndarray, shape (3,)
-        The tip in `rig` [m], which becomes the last point.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Points in `rig` [m]; few or none if the shaft runs along the baseline of the cameras.
-    """
-    stations, others = (_smooth(path.pixels) for path in paths)
-    points = np.empty((len(stations), 3))
-    count = _meeting_points(
-        (views[0].packed, views[1].packed), stations[:-1], others, PAIRING.least_step, points
+def _differ(ends: tuple[ImageEnd, ImageEnd], others: tuple[ImageEnd, ImageEnd]) -> bool:
+    """Return whether two pairs of ends differ in at least one view."""
+    return any(
+        math.dist(end.point, other.point) > PAIRING.same_px
+        for end, other in zip(ends, others, strict=True)
     )
-    points[count] = tip
-    return points[: count + 1]
-
-
-@compiled
-def _meeting_points(
-    cameras: tuple[Array, Array], stations: Array, others: Array, least_step: float, points: Array
-) -> int:
-    """Write the points where the rays of the stations meet the surface of the other rays.
-
-    Parameters
-    ----------
-    cameras : pair of ndarray
-        Packed cameras, from `pack_camera`.
-    stations, others : ndarray, shape (m, 2) and (n, 2)
-        Pixels of one image, and of the other in the order of its path.
-    least_step : float
-        As in `PairingSettings` [m].
-    points : ndarray, shape (m + 1, 3)
-        Output: the points, in `rig` [m].
-
-    Returns
-    -------
-    int
-        Number of points.
-    """
-    origins, directions = np.empty((len(others), 3)), np.empty((len(others), 3))
-    for i in range(len(others)):
-        pixel_ray(cameras[1], others[i], origins[i], directions[i])
-    origin, direction, between, across = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    moment, miss = np.empty(3), np.empty(len(others))
-    alike = len(others) / (len(stations) + 1)
-    count = 0
-    for k in range(len(stations)):
-        pixel_ray(cameras[0], stations[k], origin, direction)
-        chosen, least = -1, math.inf
-        for i in range(len(others)):
-            # Signed distance between the ray of the station and each ray of the other image.
-            between[:] = origins[i] - origin
-            cross(direction, directions[i], across)
-            miss[i] = dot(between, across) / math.sqrt(dot(across, across))
-            # Among several crossings, choose the one at about the same share of the path.
-            away = abs(i - 1 - alike * k)
-            if i and miss[i] * miss[i - 1] < 0.0 and away < least:
-                chosen, least = i - 1, away
-        if chosen < 0 or abs(miss[chosen + 1] - miss[chosen]) < least_step / alike:
-            continue
-        share = miss[chosen] / (miss[chosen] - miss[chosen + 1])
-        other = (1.0 - share) * directions[chosen] + share * directions[chosen + 1]
-        between[:] = (1.0 - share) * origins[chosen] + share * origins[chosen + 1] - origin
-        cross(direction, other, across)
-        cross(between, other, moment)
-        points[count] = origin + dot(moment, across) / dot(across, across) * direction
-        count += 1
-    return count
-
-
-def is_reachable(points: Array, needle: StereoTrackerParameters) -> bool:
-    """Return whether most points along a shaft are within reach.
-
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3)
-        Points from `shaft_points`.
-    needle : StereoTrackerParameters
-        Reach of the needle.
-    """
-    distance = np.linalg.norm(points, axis=1)
-    sideways = np.linalg.norm(points[:, :2], axis=1)
-    angle = np.minimum(needle.chord_angle(distance), math.pi / 2)
-    allowed = distance * np.sin(angle) + PAIRING.tolerance
-    return bool(np.median(sideways - allowed) <= 0.0)
 
 
 def shaft_length(points: Array) -> float:
@@ -359,11 +227,3 @@ def shaft_length(points: Array) -> float:
 def _bends(s: Array) -> Array:
     """Return a quadratic and a cubic that are 0 at both ends of the curve, shape (n, 2)."""
     return np.stack([s**2 - s, s**3 - s], axis=1)
-
-
-def _smooth(pixels: Array) -> Array:
-    """Smooth the steps of the cells out of a path: a moving average, shorter at the ends."""
-    row = np.arange(len(pixels))
-    half = np.minimum(SEARCH.smooth_rows // 2, np.minimum(row, row[::-1]))
-    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(pixels, axis=0)])
-    return np.asarray((sums[row + half + 1] - sums[row - half]) / (2 * half + 1)[:, None])
