@@ -7,7 +7,6 @@ import csv
 import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TextIO
 
 import cv2
 import numpy as np
@@ -93,8 +92,8 @@ class ImageFolder:
             (folder / "calibration.yaml").write_bytes(calibration)
             for side in ("left", "right"):
                 (folder / side).mkdir()
-            self._insertions = self._table("insertion.csv", _INSERTION_COLUMNS)
-            self._truths = self._table("truth.csv", _TRUTH_COLUMNS + more_columns)
+            self._add("insertion.csv", _INSERTION_COLUMNS)
+            self._add("truth.csv", _TRUTH_COLUMNS + more_columns)
 
     def write(
         self,
@@ -138,20 +137,15 @@ class ImageFolder:
             for side, image in zip(("left", "right"), images, strict=True):
                 data = cv2.imencode(".png", image, _PNG_OPTIONS)[1]
                 (self._folder / side / name).write_bytes(data.tobytes())
-            _add(self._insertions, [name, repr(float(insertion))])
+            self._add("insertion.csv", [name, repr(float(insertion))])
             # repr() keeps all digits.
             row = (v if isinstance(v, str) else repr(v) for v in (*values, *visible, *more))
-            _add(self._truths, [name, *row])
+            self._add("truth.csv", [name, *row])
 
-    def close(self) -> None:
-        """Close the tables, which are complete up to the last exposure at any time."""
-        self._insertions.close()
-        self._truths.close()
-
-    def _table(self, name: str, columns: tuple[str, ...]) -> TextIO:
-        stream = (self._folder / name).open("w", encoding="utf-8", newline="")
-        _add(stream, columns)
-        return stream
+    def _add(self, table: str, row: Sequence[str]) -> None:
+        """Add a row to a table, which is closed again: it is complete at any time."""
+        with (self._folder / table).open("a", encoding="utf-8", newline="") as stream:
+            csv.writer(stream, lineterminator="\n").writerow(row)
 
     @contextlib.contextmanager
     def _reported_errors(self) -> Iterator[None]:
@@ -159,8 +153,3 @@ class ImageFolder:
             yield
         except OSError as error:
             raise UserError(f"cannot write {self._folder}: {error.strerror}") from error
-
-
-def _add(stream: TextIO, row: Sequence[str]) -> None:
-    csv.writer(stream, lineterminator="\n").writerow(row)
-    stream.flush()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import math
 import sys
@@ -152,14 +151,14 @@ def _write(
         pairs = render_insertion(rig, look, seed=seed, **path)
     else:
         columns, pairs = TRUTH_COLUMNS, trace_insertion(load_mitsuba(), rig, look, **path)
-    with contextlib.closing(ImageFolder(output, calibration, columns)) as folder:
-        for pair in pairs:
-            more: Sequence[float | str] = ()
-            if isinstance(look, Appearance) and isinstance(pair, TracedPair):
-                more = truth_values(look, pair)
-            visible = pair.visible_share
-            folder.write(pair.number, pair.images, pair.insertion, pair.truth, visible, more=more)
-            yield
+    folder = ImageFolder(output, calibration, columns)
+    for pair in pairs:
+        more: Sequence[float | str] = ()
+        if isinstance(look, Appearance) and isinstance(pair, TracedPair):
+            more = truth_values(look, pair)
+        visible = pair.visible_share
+        folder.write(pair.number, pair.images, pair.insertion, pair.truth, visible, more=more)
+        yield
 
 
 def _parser() -> CommandParser:
