@@ -23,7 +23,7 @@ from needle_core.component import (
     Send,
 )
 from needle_core.files.installed import find_shared_file
-from needle_sim.camera.image_folder import ImageFolder, truth_of
+from needle_sim.camera.image_folder import ImageFolder, RenderedPair, truth_of
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import SCENARIOS
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
@@ -101,13 +101,10 @@ class StereoCameras:
         pose, line, number = exposure.T_rig_tip, exposure.centreline, exposure.number
         images = self._renderer.render(pose, line, number)
         if self._folder is not None:
-            self._folder.write(
-                number,
-                images,
-                exposure.insertion,
-                truth_of(pose, self._needle) if self._has_needle and len(line) > 1 else None,
-                self._renderer.visible_share(pose, line, number),
-            )
+            has_needle = self._has_needle and len(line) > 1
+            truth = truth_of(pose, self._needle) if has_needle else None
+            visible = self._renderer.visible_share(pose, line, number)
+            self._folder.write(RenderedPair(number, images, exposure.insertion, truth, visible))
         messages, stamp_ns = [], exposure.stamp_ns
         for side, image, frame, camera in zip(
             ("left", "right"), images, _FRAMES, self._cameras, strict=True
