@@ -39,8 +39,9 @@ class Worker:
 
     def __init__(self, make: Callable[..., Callable[[Any], Any]], *arguments: Any) -> None:
         self._items: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        # By its file: `python -m` would look for modules in the working directory first.
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__],
+            [sys.executable, __file__],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
