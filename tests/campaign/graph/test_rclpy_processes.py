@@ -10,7 +10,6 @@ import subprocess
 import sys
 import uuid
 from pathlib import Path
-from typing import ClassVar
 
 import pytest
 from rclpy.context import Context
@@ -19,8 +18,6 @@ from rclpy.node import Node
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import FIRST_PARTICIPANT, Claim, ports_of, reserve_domain_id
 from needle_core.process.shared_memory import SHARED_MEMORY
-from needle_core.process.shutdown import ENDING_SIGNALS
-from needle_core.process.worker import start_worker
 from needle_core.settings.parameter_files import values_for
 
 
@@ -149,32 +146,6 @@ def test_a_kill_releases_the_name_of_a_process() -> None:
         first.kill()
         first.wait()
         Claim(name, "/second").release()
-
-
-class WorkerState:
-    """State that is prepared in the worker."""
-
-    content: ClassVar[str] = ""
-
-    @staticmethod
-    def put(content: str) -> None:
-        WorkerState.content = content
-
-    @staticmethod
-    def report() -> tuple[int, str]:
-        return os.getpid(), WorkerState.content
-
-
-@pytest.mark.parametrize("number", ENDING_SIGNALS)
-def test_a_signal_ends_no_worker_and_is_not_blocked_in_the_parent(number: signal.Signals) -> None:
-    with start_worker(WorkerState.put, "images") as worker:
-        process, content = worker.submit(WorkerState.report).result()
-        assert content == "images"
-        assert process != os.getpid()
-        os.kill(process, number)
-        assert worker.submit(WorkerState.report).result() == (process, "images")
-    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(ENDING_SIGNALS)
-    assert WorkerState.content == ""
 
 
 REMAPPINGS = {

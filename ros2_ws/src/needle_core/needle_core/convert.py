@@ -7,18 +7,41 @@ written and read with and without ROS.
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from needle_core import messages as m
 from needle_core.diagnostics import Level
-from needle_core.message_types import MessageTypes, Row, floats, head, to_nanoseconds, xyz, xyzw
+from needle_core.message_shapes import (
+    BOOL,
+    COLOUR,
+    DOUBLES,
+    DURATION,
+    FLOATS,
+    HEADER,
+    INT,
+    INTS,
+    ONLY_STAMP,
+    PIXELS,
+    POINT,
+    POSE,
+    QUATERNION,
+    STAMP,
+    TEXT,
+    TEXTS,
+    VECTOR,
+    Codec,
+    Row,
+    Shape,
+    duration,
+    each,
+    empty,
+    fixed,
+)
+from needle_core.message_types import MessageTypes, to_nanoseconds
 from needle_core.status_messages import ControllerStatus, DeviceStatus, KeyValues
-from needle_core.view_rows import VIEW_ROWS
-
-_STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
-_LOG_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40, "fatal": 50}
 
 
 class Converter:
@@ -35,8 +58,7 @@ class Converter:
 
     def to_ros(self, message: Any) -> Any:
         """Return a message as a ROS message."""
-        row = TABLE[type(message)]
-        return self._types.make(row.ros_type)(**row.to_fields(message, self._types))
+        return TABLE[type(message)].to_ros(message, self._types)
 
 
 def ros_type(kind: type[Any]) -> str:
@@ -52,209 +74,236 @@ def from_ros(kind: type[Any], message: Any) -> Any:
     return TABLE[kind].from_ros(message)
 
 
-def _joint_state_fields(message: m.JointState, t: MessageTypes) -> dict[str, Any]:
-    return {
-        "header": t.header_of(message),
-        "name": list(message.names),
-        "position": t.array(np.float64, message.positions),
-        "velocity": t.array(np.float64, message.velocities),
-        "effort": t.array(np.float64, ()),
-    }
+# ---- messages whose attributes are not fields -------------------------------------------------
+
+_POINT = Shape(
+    "trajectory_msgs/msg/JointTrajectoryPoint",
+    positions=DOUBLES,
+    velocities=DOUBLES.of("others"),
+    accelerations=empty(np.float64),
+    effort=empty(np.float64),
+    time_from_start=DURATION,
+)
 
 
-def _trajectory_fields(message: m.Trajectory, t: MessageTypes) -> dict[str, Any]:
-    make, none = t.make("trajectory_msgs/msg/JointTrajectoryPoint"), ()
-    points = [
-        make(
-            positions=t.array(np.float64, point.positions),
-            velocities=t.array(np.float64, point.others),
-            accelerations=t.array(np.float64, none),
-            effort=t.array(np.float64, none),
-            time_from_start=t.duration(point.time_from_start),
-        )
-        for point in message.points
-    ]
-    names = list(message.joint_names)
-    return {"header": t.header(message.stamp_ns), "joint_names": names, "points": points}
+def _trajectory_point(r: Any) -> m.TrajectoryPoint:
+    others = DOUBLES.from_ros((*r.velocities, *r.accelerations, *r.effort))
+    return m.TrajectoryPoint(**{**_POINT.values(r), "others": others})
 
 
-def _trajectory(message: Any) -> m.Trajectory:
-    points = [
-        m.TrajectoryPoint(
-            floats(point.positions),
-            int(point.time_from_start.sec) + int(point.time_from_start.nanosec) * 1e-9,
-            floats((*point.velocities, *point.accelerations, *point.effort)),
-        )
-        for point in message.points
-    ]
-    names = tuple(message.joint_names)
-    return m.Trajectory(to_nanoseconds(message.header.stamp), names, tuple(points))
+_JOY = {"axes": FLOATS, "buttons": INTS}
+_HOLD = Shape("sensor_msgs/msg/Joy", header=HEADER, **_JOY)
 
 
-def _joystick_fields(message: m.Joystick, t: MessageTypes, frame_id: str = "") -> dict[str, Any]:
-    return {
-        "header": t.header(message.stamp_ns, frame_id),
-        "axes": t.array(np.float32, message.axes),
-        "buttons": t.array(np.int32, message.buttons),
-    }
-
-
-def _joystick(message: Any) -> m.Joystick:
-    buttons = tuple(int(button) for button in message.buttons)
-    return m.Joystick(to_nanoseconds(message.header.stamp), floats(message.axes), buttons)
-
-
-def _hold_fields(message: m.HoldState, t: MessageTypes) -> dict[str, Any]:
+def _hold_to_ros(message: m.HoldState, t: MessageTypes) -> Any:
     axes = (message.speed_scale, *filter(math.isfinite, (message.lifetime,)))
-    joystick = m.Joystick(message.count, axes, (int(message.pressed),))
-    return _joystick_fields(joystick, t, message.sender)
+    buttons = (int(message.pressed),)
+    joy = SimpleNamespace(
+        stamp_ns=message.count, frame_id=message.sender, axes=axes, buttons=buttons
+    )
+    return _HOLD.to_ros(joy, t)
 
 
-def _hold(message: Any) -> m.HoldState:
+def _hold(r: Any) -> m.HoldState:
     """Return the hold state in a Joy message; without a button or an axis it is a release."""
-    axes, buttons = message.axes, message.buttons
+    axes, buttons = r.axes, r.buttons
     return m.HoldState(
-        *m.HoldState.split_sender(message.header.frame_id),
-        to_nanoseconds(message.header.stamp),
+        *m.HoldState.split_sender(r.header.frame_id),
+        to_nanoseconds(r.header.stamp),
         len(buttons) > 0 and int(buttons[0]) == 1,
         float(axes[0]) if len(axes) > 0 else math.nan,
         float(axes[1]) if len(axes) > 1 else math.inf,
     )
 
 
-def _covariance_fields(message: m.PoseWithCovariance, t: MessageTypes) -> dict[str, Any]:
-    pose = t.make("geometry_msgs/msg/PoseWithCovariance")(
-        pose=t.pose(message.position, message.orientation),
-        covariance=t.array(np.float64, message.covariance),
-    )
-    return {"header": t.header_of(message), "pose": pose}
-
-
-def _status_fields(message: m.Status, t: MessageTypes) -> dict[str, Any]:
+def _pairs_to_ros(values: dict[str, str], t: MessageTypes) -> list[Any]:
     make = t.make("diagnostic_msgs/msg/KeyValue")
-    return {
-        "level": t.byte(int(message.level)),
-        "name": f"{message.source}: {message.part}",
-        "message": message.text,
-        "hardware_id": message.source,
-        "values": [make(key=key, value=value) for key, value in message.values.items()],
-    }
+    return [make(key=key, value=value) for key, value in values.items()]
 
 
-def _status(message: Any) -> m.Status:
-    level = message.level
-    return m.Status(
-        message.hardware_id,
-        message.name.rpartition(": ")[2],
-        Level(level[0] if isinstance(level, bytes) else int(level)),
-        message.message,
-        {pair.key: pair.value for pair in message.values},
-    )
+_STATUS = Shape(
+    "diagnostic_msgs/msg/DiagnosticStatus",
+    level=Codec(
+        lambda level, t: t.byte(int(level)),
+        lambda r: Level(r[0] if isinstance(r, bytes) else int(r)),
+    ),
+    name=TEXT,
+    message=TEXT.of("text"),
+    hardware_id=TEXT.of("source"),
+    values=Codec(_pairs_to_ros, lambda r: {pair.key: pair.value for pair in r}),
+)
+
+
+def _status(r: Any) -> m.Status:
+    values = _STATUS.values(r)
+    return m.Status(part=values.pop("name").rpartition(": ")[2], **values)
 
 
 def _key_values(kind: type[KeyValues]) -> Row:
     return Row(
-        _STATUS, lambda message, t: _status_fields(message.status, t), lambda r: kind.of(_status(r))
+        _STATUS.ros_type,
+        lambda message, t: _STATUS.to_ros(message.status, t),
+        lambda r: kind.of(_status(r)),
     )
 
 
-def _diagnostics_fields(message: m.Diagnostics, t: MessageTypes) -> dict[str, Any]:
-    make = t.make(_STATUS)
-    statuses = [make(**_status_fields(status, t)) for status in message.statuses]
-    return {"header": t.header(message.stamp_ns), "status": statuses}
+def _path_to_ros(path: m.Path, t: MessageTypes) -> Any:
+    header, upright = HEADER.to_ros(path, t), (0.0, 0.0, 0.0, 1.0)
+    make = t.make("geometry_msgs/msg/PoseStamped")
+    poses = [make(header=header, pose=_pair_to_ros((at, upright), t)) for at in path.positions]
+    return t.make("nav_msgs/msg/Path")(header=header, poses=poses)
 
 
-def _log_fields(message: m.LogLine, t: MessageTypes) -> dict[str, Any]:
-    return {
-        "stamp": t.time(message.stamp_ns),
-        "level": _LOG_LEVELS[message.severity],
-        "name": message.source.lstrip("/"),
-        "msg": message.text,
-        "file": "",
-        "function": "",
-        "line": 0,
-    }
+def _path(r: Any) -> m.Path:
+    positions = (POINT.from_ros(pose.pose.position) for pose in r.poses)
+    return m.Path(positions=tuple(positions), **HEADER.values(r.header))
 
 
-def _log(r: Any) -> m.LogLine:
-    severity = {level: name for name, level in _LOG_LEVELS.items()}[int(r.level)]
-    return m.LogLine(to_nanoseconds(r.stamp), severity, r.name, r.msg)
+def _pair_to_ros(pair: tuple[m.Vector3, m.Quaternion], t: MessageTypes) -> Any:
+    return POSE.to_ros(SimpleNamespace(position=pair[0], orientation=pair[1]), t)
 
+
+_PAIR = Codec(
+    _pair_to_ros, lambda r: (POINT.from_ros(r.position), QUATERNION.from_ros(r.orientation))
+)
+
+
+# ---- the table --------------------------------------------------------------------------------
+
+_STATUS_ROW = Row(_STATUS.ros_type, _STATUS.to_ros, _status)
+_POINT_ROW = Row(_POINT.ros_type, _POINT.to_ros, _trajectory_point)
+_TRANSFORM_ROW = Shape(
+    "geometry_msgs/msg/TransformStamped",
+    header=HEADER,
+    child_frame_id=TEXT,
+    transform=Shape("geometry_msgs/msg/Transform", translation=VECTOR, rotation=QUATERNION),
+).row(m.Transform)
+_REGION_ROW = Shape(
+    "sensor_msgs/msg/RegionOfInterest",
+    x_offset=INT,
+    y_offset=INT,
+    height=INT,
+    width=INT,
+    do_rectify=fixed(False),
+).row(m.RegionOfInterest)
+_MARKER_ROW = Shape(
+    "visualization_msgs/msg/Marker",
+    header=HEADER,
+    ns=TEXT.of("namespace"),
+    id=INT.of("number"),
+    type=INT.of("kind"),
+    action=INT,
+    pose=POSE,
+    scale=VECTOR,
+    color=COLOUR.of("colour"),
+    lifetime=lambda t: duration(0.0, t),
+    frame_locked=fixed(False),
+    points=each(POINT),
+    colors=lambda t: [],
+    texture_resource=fixed(""),
+    texture=Shape(
+        "sensor_msgs/msg/CompressedImage",
+        header=Shape("std_msgs/msg/Header", stamp=lambda t: t.time(0), frame_id=fixed("")),
+        format=fixed(""),
+        data=empty(np.uint8),
+    ),
+    uv_coordinates=lambda t: [],
+    text=fixed(""),
+    mesh_resource=fixed(""),
+    mesh_file=Shape("visualization_msgs/msg/MeshFile", filename=fixed(""), data=empty(np.uint8)),
+    mesh_use_embedded_materials=fixed(False),
+).row(m.Marker)
+_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40, "fatal": 50}
+_SEVERITIES = {level: name for name, level in _LEVELS.items()}
+
+_SHAPES = {
+    m.JointState: Shape(
+        "sensor_msgs/msg/JointState",
+        header=HEADER,
+        name=TEXTS.of("names"),
+        position=DOUBLES.of("positions"),
+        velocity=DOUBLES.of("velocities"),
+        effort=empty(np.float64),
+    ),
+    m.Trajectory: Shape(
+        "trajectory_msgs/msg/JointTrajectory",
+        header=ONLY_STAMP,
+        joint_names=TEXTS,
+        points=each(_POINT_ROW),
+    ),
+    m.CommandResult: Shape(
+        "std_msgs/msg/Header", stamp=STAMP.of("stamp_ns"), frame_id=TEXT.of("outcome")
+    ),
+    m.Joystick: Shape("sensor_msgs/msg/Joy", header=ONLY_STAMP, **_JOY),
+    m.EmergencyStop: Shape("std_msgs/msg/Bool", data=BOOL.of("pressed")),
+    m.Point: Shape("geometry_msgs/msg/PointStamped", header=HEADER, point=POINT.of("position")),
+    m.Vector: Shape("geometry_msgs/msg/Vector3Stamped", header=HEADER, vector=VECTOR.of("values")),
+    m.Pose: Shape("geometry_msgs/msg/PoseStamped", header=HEADER, pose=POSE),
+    m.PoseWithCovariance: Shape(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=HEADER,
+        pose=Shape("geometry_msgs/msg/PoseWithCovariance", pose=POSE, covariance=DOUBLES),
+    ),
+    m.Text: Shape("std_msgs/msg/String", data=TEXT.of("text")),
+    m.Diagnostics: Shape(
+        "diagnostic_msgs/msg/DiagnosticArray",
+        header=ONLY_STAMP,
+        status=each(_STATUS_ROW).of("statuses"),
+    ),
+    m.Poses: Shape("geometry_msgs/msg/PoseArray", header=HEADER, poses=each(_PAIR)),
+    m.Transforms: Shape("tf2_msgs/msg/TFMessage", transforms=each(_TRANSFORM_ROW)),
+    m.Image: Shape(
+        "sensor_msgs/msg/Image",
+        header=HEADER,
+        height=INT,
+        width=INT,
+        encoding=TEXT,
+        is_bigendian=fixed(0),
+        step=INT,
+        data=PIXELS,
+    ),
+    m.CompressedImage: Shape(
+        "sensor_msgs/msg/CompressedImage",
+        header=HEADER,
+        format=TEXT,
+        data=PIXELS._replace(from_ros=bytes),
+    ),
+    m.CameraInfo: Shape(
+        "sensor_msgs/msg/CameraInfo",
+        header=HEADER,
+        height=INT,
+        width=INT,
+        distortion_model=TEXT,
+        **dict.fromkeys("dkrp", DOUBLES),
+        binning_x=INT,
+        binning_y=INT,
+        roi=Codec(_REGION_ROW.to_ros, _REGION_ROW.from_ros),
+    ),
+    m.Markers: Shape("visualization_msgs/msg/MarkerArray", markers=each(_MARKER_ROW)),
+    m.LogLine: Shape(
+        "rcl_interfaces/msg/Log",
+        stamp=STAMP.of("stamp_ns"),
+        level=Codec(lambda name, t: _LEVELS[name], lambda r: _SEVERITIES[int(r)]).of("severity"),
+        name=Codec(lambda name, t: name.lstrip("/"), str).of("source"),
+        msg=TEXT.of("text"),
+        file=fixed(""),
+        function=fixed(""),
+        line=fixed(0),
+    ),
+}
 
 TABLE: dict[type[Any], Row] = {
-    m.JointState: Row(
-        "sensor_msgs/msg/JointState",
-        _joint_state_fields,
-        lambda r: m.JointState(
-            to_nanoseconds(r.header.stamp),
-            tuple(r.name),
-            floats(r.position),
-            floats(r.velocity),
-            r.header.frame_id,
-        ),
-    ),
-    m.Trajectory: Row("trajectory_msgs/msg/JointTrajectory", _trajectory_fields, _trajectory),
-    m.CommandResult: Row(
-        "std_msgs/msg/Header",
-        lambda message, t: {"stamp": t.time(message.stamp_ns), "frame_id": message.outcome},
-        lambda r: m.CommandResult(to_nanoseconds(r.stamp), r.frame_id),
-    ),
-    m.HoldState: Row("sensor_msgs/msg/Joy", _hold_fields, _hold),
-    m.Joystick: Row("sensor_msgs/msg/Joy", _joystick_fields, _joystick),
-    m.EmergencyStop: Row(
-        "std_msgs/msg/Bool",
-        lambda message, t: {"data": message.pressed},
-        lambda r: m.EmergencyStop(bool(r.data)),
-    ),
-    m.Point: Row(
-        "geometry_msgs/msg/PointStamped",
-        lambda message, t: {"header": t.header_of(message), "point": t.point(message.position)},
-        lambda r: m.Point(*head(r), xyz(r.point)),
-    ),
+    **{kind: shape.row(kind) for kind, shape in _SHAPES.items()},
+    m.HoldState: Row(_HOLD.ros_type, _hold_to_ros, _hold),
     m.BarePoint: Row(
         "geometry_msgs/msg/Point",
-        lambda message, t: dict(zip("xyz", message.position, strict=True)),
-        lambda r: m.BarePoint(xyz(r)),
+        lambda message, t: POINT.to_ros(message.position, t),
+        lambda r: m.BarePoint(POINT.from_ros(r)),
     ),
-    m.Vector: Row(
-        "geometry_msgs/msg/Vector3Stamped",
-        lambda message, t: {"header": t.header_of(message), "vector": t.vector(message.values)},
-        lambda r: m.Vector(*head(r), xyz(r.vector)),
-    ),
-    m.Pose: Row(
-        "geometry_msgs/msg/PoseStamped",
-        lambda message, t: {
-            "header": t.header_of(message),
-            "pose": t.pose(message.position, message.orientation),
-        },
-        lambda r: m.Pose(*head(r), xyz(r.pose.position), xyzw(r.pose.orientation)),
-    ),
-    m.PoseWithCovariance: Row(
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-        _covariance_fields,
-        lambda r: m.PoseWithCovariance(
-            *head(r),
-            xyz(r.pose.pose.position),
-            xyzw(r.pose.pose.orientation),
-            floats(r.pose.covariance),
-        ),
-    ),
-    m.Text: Row(
-        "std_msgs/msg/String",
-        lambda message, t: {"data": message.text},
-        lambda r: m.Text(r.data),
-    ),
-    m.Status: Row(_STATUS, _status_fields, _status),
+    m.Status: _STATUS_ROW,
     DeviceStatus: _key_values(DeviceStatus),
     ControllerStatus: _key_values(ControllerStatus),
-    m.Diagnostics: Row(
-        "diagnostic_msgs/msg/DiagnosticArray",
-        _diagnostics_fields,
-        lambda r: m.Diagnostics(
-            to_nanoseconds(r.header.stamp), tuple(_status(status) for status in r.status)
-        ),
-    ),
-    **VIEW_ROWS,
-    m.LogLine: Row("rcl_interfaces/msg/Log", _log_fields, _log),
+    m.Path: Row("nav_msgs/msg/Path", _path_to_ros, _path),
+    m.Transform: _TRANSFORM_ROW,
 }
 """Message class to its row."""

@@ -6,6 +6,8 @@ import dataclasses
 import enum
 from collections.abc import Sequence
 
+_MAX_NAMES = 4
+
 
 class Level(enum.IntEnum):
     """Severity, with the numbers of diagnostic_msgs/DiagnosticStatus."""
@@ -56,17 +58,9 @@ def sanitize(text: str, max_length: int = 64) -> str:
     return kept if len(text) <= max_length else kept + "..."
 
 
-def sanitize_list(names: Sequence[str], max_count: int = 4) -> str:
-    """Return names of other nodes as a list of bounded length, or `none`.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Names to sanitize.
-    max_count : int
-        Maximum number of names; the rest is counted.
-    """
-    shown = [sanitize(name) for name in names[:max_count]]
-    if len(names) > max_count:
-        shown.append(f"and {len(names) - max_count} more")
+def sanitize_list(names: Sequence[str]) -> str:
+    """Return names of other nodes as a list, or `none`; names beyond the fourth are counted."""
+    shown = [sanitize(name) for name in names[:_MAX_NAMES]]
+    if len(names) > _MAX_NAMES:
+        shown.append(f"and {len(names) - _MAX_NAMES} more")
     return ", ".join(shown) or "none"

@@ -29,11 +29,6 @@ class OutOfBoundsError(UserError, ValueError):
         sign = "" if unit == "-" else f" {unit}"
         bounds = f"[{_format(lower)}, {_format(upper)}]"
         super().__init__(f"{name} = {_format(value)}{sign} is outside {bounds}{sign}")
-        self.name = name
-        self.value = value
-        self.lower = lower
-        self.upper = upper
-        self.unit = unit
 
 
 def _format(value: float) -> str:

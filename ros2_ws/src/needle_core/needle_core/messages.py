@@ -298,6 +298,11 @@ class Status:
     text: str
     values: dict[str, str] = field(default_factory=dict)
 
+    @property
+    def name(self) -> str:
+        """Name of the status in ROS: source and part."""
+        return f"{self.source}: {self.part}"
+
     @staticmethod
     def of(source: str, part: str, diagnostic: Diagnostic) -> Status:
         """Return a diagnostic of a component as a message."""

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from needle_core import messages as m
-from needle_core.component import IMAGES, Actions, Moment, Output, Port, Publish, Send
+from needle_core.commands.cli import EXIT_MISSED
+from needle_core.component import (
+    IMAGES,
+    Actions,
+    Exit,
+    Moment,
+    Output,
+    Port,
+    PortChange,
+    Publish,
+    Send,
+)
 from needle_core.files.installed import find_shared_file
-from needle_core.process.worker import start_worker
-from needle_sim.camera.image_folder import ImageFolder, truth_of
+from needle_sim.camera.image_folder import ImageFolder, RenderedPair, truth_of
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import SCENARIOS
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
@@ -90,30 +96,24 @@ class StereoCameras:
         if settings.images:
             self._folder = ImageFolder(Path(settings.images).expanduser(), file)
 
-    def render(self, exposure: Exposure) -> Iterable[Publish]:
+    def render(self, exposure: Exposure) -> list[Publish]:
         """Return the two images of an exposure, each after its camera_info."""
         pose, line, number = exposure.T_rig_tip, exposure.centreline, exposure.number
         images = self._renderer.render(pose, line, number)
         if self._folder is not None:
-            self._folder.write(
-                number,
-                images,
-                exposure.insertion,
-                truth_of(pose, self._needle) if self._has_needle and len(line) > 1 else None,
-                self._renderer.visible_share(pose, line, number),
-            )
-        stamp_ns = exposure.stamp_ns
+            has_needle = self._has_needle and len(line) > 1
+            truth = truth_of(pose, self._needle) if has_needle else None
+            visible = self._renderer.visible_share(pose, line, number)
+            self._folder.write(RenderedPair(number, images, exposure.insertion, truth, visible))
+        messages, stamp_ns = [], exposure.stamp_ns
         for side, image, frame, camera in zip(
             ("left", "right"), images, _FRAMES, self._cameras, strict=True
         ):
             info = camera_info_message(camera, frame, stamp_ns)
-            yield Publish(f"stereo/{side}/camera_info", info)
-            yield Publish(f"stereo/{side}/image_raw", image_message(image, frame, stamp_ns))
-
-    def close(self) -> None:
-        """Close the files of the image folder."""
-        if self._folder is not None:
-            self._folder.close()
+            messages.append(Publish(f"stereo/{side}/camera_info", info))
+            pixels = image_message(image, frame, stamp_ns)
+            messages.append(Publish(f"stereo/{side}/image_raw", pixels))
+        return messages
 
 
 class CameraSensor(StereoCameras):
@@ -159,9 +159,6 @@ class RemoteCameras:
         """Send the exposure through the port."""
         yield Send(CAMERAS, (Exposure.of(self._bench, number, stamp_ns),))
 
-    def close(self) -> None:
-        """Do nothing: the other process owns the files."""
-
 
 class PublishedRemoteCameras(RemoteCameras):
     """Remote cameras whose images return through the port and are published here.
@@ -174,7 +171,7 @@ class PublishedRemoteCameras(RemoteCameras):
     def __init__(self, bench: SimulatedBench, settings: SimRigParameters) -> None:
         super().__init__(bench, settings)
         self._pending = 0
-        self.ports = (Port(CAMERAS, self._on_images),)
+        self.ports = (Port(CAMERAS, self._on_images, self._on_change),)
 
     def expose(self, number: int, stamp_ns: int) -> Actions:
         """Send the exposure through the port, unless too many are pending."""
@@ -187,54 +184,13 @@ class PublishedRemoteCameras(RemoteCameras):
             self._pending -= 1
             yield from images
 
+    def _on_change(self, change: PortChange, at: Moment) -> Actions:
+        yield Exit(EXIT_MISSED, change.lost)
 
-class RenderingProcess:
-    """Real implementation of the port `cameras`: a process that renders exposures.
 
-    Parameters
-    ----------
-    settings : SimRigParameters
-        Parameters of the rig.
-    """
-
-    _cameras: ClassVar[StereoCameras]
-    """Cameras of the rendering process; unset in the parent."""
-
-    def __init__(self, settings: SimRigParameters) -> None:
-        self._pool = start_worker(RenderingProcess._begin, settings)
-
-    def open(self, arrive: Callable[[Any], None]) -> None:
-        """Set the callback that receives rendered images."""
-        self._arrive = arrive
-
-    def send(self, batch: tuple[Exposure, ...]) -> None:
-        """Queue exposures for rendering."""
-        with contextlib.suppress(BrokenProcessPool):
-            for exposure in batch:
-                future = self._pool.submit(RenderingProcess._render, exposure)
-                future.add_done_callback(self._on_done)
-
-    def close(self) -> None:
-        """Close the files of the image folder and end the process."""
-        with contextlib.suppress(BrokenProcessPool):
-            self._pool.submit(RenderingProcess._end)
-        self._pool.shutdown(wait=True)
-
-    def _on_done(self, future: Future[list[Publish]]) -> None:
-        if not future.cancelled() and future.exception() is None:
-            self._arrive((future.result(),))
-
-    @staticmethod
-    def _begin(settings: SimRigParameters) -> None:
-        RenderingProcess._cameras = StereoCameras(settings)
-
-    @staticmethod
-    def _render(exposure: Exposure) -> list[Publish]:
-        return list(RenderingProcess._cameras.render(exposure))
-
-    @staticmethod
-    def _end() -> None:
-        RenderingProcess._cameras.close()
+def make_renderer(settings: SimRigParameters) -> Callable[[Exposure], list[Publish]]:
+    """Return the function that renders exposures in another process."""
+    return StereoCameras(settings).render
 
 
 def _load_calibration(settings: SimRigParameters) -> tuple[Path, StereoRig]:

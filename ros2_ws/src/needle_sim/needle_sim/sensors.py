@@ -38,9 +38,6 @@ class Sensor(Protocol):
     def expose(self, number: int, stamp_ns: int) -> Actions:
         """Return the messages of an exposure."""
 
-    def close(self) -> None:
-        """Close the files that it writes."""
-
 
 class TipSensor:
     """Sensor of level `tip`: the tip position with uniform noise.
@@ -73,9 +70,6 @@ class TipSensor:
         pose = m.PoseWithCovariance(stamp_ns, RIG, (x, y, z), _UPRIGHT, tuple(covariance))
         yield Publish("needle/tip_pose", pose)
         yield Publish("needle/tip", m.Point(stamp_ns, RIG, (x, y, z)))
-
-    def close(self) -> None:
-        """Do nothing: no file is open."""
 
 
 def make_sensor(bench: SimulatedBench, settings: SimRigParameters) -> Sensor:

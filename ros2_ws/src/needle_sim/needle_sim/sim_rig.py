@@ -6,13 +6,11 @@ import math
 from collections.abc import Callable
 
 from needle_core import messages as m
-from needle_core.commands.cli import EXIT_DONE
 from needle_core.component import (
     LATCHED,
     Actions,
     Component,
     Diagnose,
-    Exit,
     Input,
     Moment,
     Output,
@@ -88,15 +86,6 @@ class SimRig(Component):
             Timer(CYCLE, self._cycle),
             Timer(1.0 / settings.camera_rate, self._expose_if_due),
         )
-
-    def close(self) -> None:
-        """Close the files that the sensor writes."""
-        self._sensor.close()
-
-    def on_stop(self, at: Moment) -> Actions:
-        """Close the files that the sensor writes, and exit."""
-        self.close()
-        yield Exit(EXIT_DONE)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Check for other devices on the graph."""

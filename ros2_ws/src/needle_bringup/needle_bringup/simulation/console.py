@@ -187,12 +187,13 @@ def _make_rig(parameters: Parameters) -> tuple[list[Component], dict[str, RealPo
     from needle_bringup.simulation.vision import (  # noqa: PLC0415
         VISION,
         RemoteTracker,
-        VisionProcess,
+        make_vision,
     )
+    from needle_core.ports.worker import Worker  # noqa: PLC0415
     from needle_sim.cameras import RemoteCameras  # noqa: PLC0415
 
     rig = make_rig(parameters, RemoteCameras, lambda _: RemoteTracker())
-    return rig, {VISION: VisionProcess(parameters)}
+    return rig, {VISION: Worker(make_vision, parameters)}
 
 
 def run_nodes(options: ConsoleOptions, rig: Parameters, end: ShutdownFlag) -> int:

@@ -205,9 +205,6 @@ def run_virtually(
         ended = runner.exits.get(operator)
         progress.close(f"{operator}: {ended.text}" if ended else "")
         tap.close()
-        for component in components:
-            if isinstance(component, SimRig):
-                component.close()
 
 
 def _check_exits(exits: Mapping[str, Exit], operator: str) -> None:

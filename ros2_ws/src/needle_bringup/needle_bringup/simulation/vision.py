@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import ClassVar
 
 from needle_bringup.simulation.virtual_run import make_tracker, settings_of
 from needle_core import messages as m
@@ -27,7 +24,6 @@ from needle_core.component import (
     Send,
     Timer,
 )
-from needle_core.process.worker import start_worker
 from needle_core.settings.parameter_files import Parameters
 from needle_sim.cameras import CAMERAS, Exposure, StereoCameras
 from needle_sim.sim_rig_parameters import SimRigParameters
@@ -40,77 +36,26 @@ _CHECK_PERIOD = 0.05
 
 Item = Exposure | m.JointState | None
 """Input of the process; None is a timer tick."""
-Done = Future[list[Action]]
 
 
-class VisionWorker:
-    """Cameras and tracker inside the second process.
+def make_vision(parameters: Parameters) -> Callable[[tuple[Item, Moment]], list[Action]]:
+    """Return the function that passes inputs to cameras and tracker in another process."""
+    cameras = StereoCameras(settings_of(SimRigParameters, parameters, "sim_rig"))
+    tracker = make_tracker(parameters)
+    handlers = {row.topic: row.handler for row in tracker.inputs}
 
-    Parameters
-    ----------
-    parameters : Parameters
-        Parameters by node.
-    """
+    def handle(given: tuple[Item, Moment]) -> list[Action]:
+        item, at = given
+        if item is None:
+            return list(tracker.check(at))
+        if isinstance(item, m.JointState):
+            return list(handlers["joint_states"](item, at))
+        actions: list[Action] = []
+        for image in cameras.render(item):
+            actions += [image, *handlers[image.topic](image.message, at)]
+        return actions
 
-    instance: ClassVar[VisionWorker]
-    """The only instance in the process."""
-
-    def __init__(self, parameters: Parameters) -> None:
-        self._cameras = StereoCameras(settings_of(SimRigParameters, parameters, "sim_rig"))
-        self._tracker = make_tracker(parameters)
-        self._handlers = {row.topic: row.handler for row in self._tracker.inputs}
-
-    @staticmethod
-    def open(parameters: Parameters) -> None:
-        """Create the instance of this process."""
-        VisionWorker.instance = VisionWorker(parameters)
-
-    @staticmethod
-    def work(item: Item, at: Moment) -> list[Action]:
-        """Return the actions of cameras and tracker for an input."""
-        return list(VisionWorker.instance.handle(item, at))
-
-    def handle(self, item: Item, at: Moment) -> Iterable[Action]:
-        """Return the actions of cameras and tracker for an input."""
-        match item:
-            case Exposure():
-                for image in self._cameras.render(item):
-                    yield image
-                    yield from self._handlers[image.topic](image.message, at)
-            case m.JointState():
-                yield from self._handlers["joint_states"](item, at)
-            case _:
-                yield from self._tracker.check(at)
-
-
-class VisionProcess:
-    """Process of a `VisionWorker`: the real port `vision`.
-
-    Parameters
-    ----------
-    parameters : Parameters
-        Parameters by node.
-    """
-
-    def __init__(self, parameters: Parameters) -> None:
-        self._pool = start_worker(VisionWorker.open, parameters)
-
-    def open(self, arrive: Callable[[tuple[Done] | PortChange], None]) -> None:
-        """Pass results to `arrive` from now on."""
-        self._arrive = arrive
-
-    def send(self, batch: Sequence[tuple[Item, Moment]]) -> None:
-        """Submit inputs."""
-        try:
-            for item, at in batch:
-                done = self._pool.submit(VisionWorker.work, item, at)
-                done.add_done_callback(lambda done: self._arrive((done,)))
-        except BrokenProcessPool:
-            self._arrive(PortChange("the process that renders and tracks has ended"))
-
-    def close(self) -> None:
-        """End the process after its current input."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
+    return handle
 
 
 class RemoteTracker(Component):
@@ -147,10 +92,10 @@ class RemoteTracker(Component):
             if sum(self._pending) < _MAX_EXPOSURES:
                 yield from self._submit(exposure, at)
 
-    def _on_results(self, batch: Sequence[Done], at: Moment) -> Actions:
-        for done in batch:
+    def _on_results(self, batch: Sequence[list[Action]], at: Moment) -> Actions:
+        for actions in batch:
             self._pending.popleft()
-            yield from done.result()
+            yield from actions
 
     def _on_change(self, change: PortChange, at: Moment) -> Actions:
         yield Exit(EXIT_MISSED, change.lost)

@@ -132,7 +132,6 @@ def lossy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, str]:
     lost = (drop("stereo/left/image_raw", 0.4),)
     rig = Rig(*words, faults=lost, bag=bag, images=images, scenario="clutter")
     assert rig.until_end() == 0
-    rig.sim_rig.close()
     assert rig.tap is not None
     rig.tap.close()
     with contextlib.redirect_stdout(io.StringIO()) as output:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from needle_bringup.simulation import vision
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import parse
-from needle_bringup.simulation.vision import VISION, RemoteTracker, VisionProcess, VisionWorker
+from needle_bringup.simulation.vision import VISION, RemoteTracker, make_vision
 from needle_core import messages as m
-from needle_core.component import Action, Exit, Moment, PortChange, Publish, Send
+from needle_core.component import Exit, Moment, PortChange, Publish, Send
 from needle_sim.cameras import CAMERAS, Exposure
 from needle_sim.needle.bench import SimulatedBench
 
@@ -30,72 +25,29 @@ def exposure(insertion: float, stamp_ns: int = AT.stamp_ns) -> Exposure:
     return Exposure.of(bench, 3, stamp_ns)
 
 
-class PlayedPool:
-    """Pool that works in this process at once; after its end it accepts nothing."""
-
-    def __init__(self, begin: Callable[..., None], *given: object) -> None:
-        begin(*given)
-        self.is_broken = False
-
-    def submit(self, work: Callable[..., Any], *given: object) -> Future[Any]:
-        if self.is_broken:
-            raise BrokenProcessPool
-        done: Future[Any] = Future()
-        done.set_result(work(*given))
-        return done
-
-    def shutdown(self, **_: object) -> None:
-        self.is_broken = True
-
-
-@pytest.fixture(scope="module")
-def process() -> Iterator[tuple[VisionProcess, list[Any]]]:
-    """Return cameras and tracker as in their process, and the received answers."""
-    arrived: list[Any] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vision, "start_worker", PlayedPool)
-        made = VisionProcess(PARAMETERS)
-        made.open(arrived.append)
-        VisionWorker.work(exposure(0.0, 1), Moment(0.0, 1))
-        yield made, arrived
-
-
-def test_an_exposure_becomes_images_and_a_tip_near_the_truth(
-    process: tuple[VisionProcess, list[Any]],
-) -> None:
-    (eyes, arrived), seen = process, exposure(0.05)
+def test_an_exposure_becomes_images_and_a_tip_near_the_truth() -> None:
+    handle, seen = make_vision(PARAMETERS), exposure(0.05)
+    handle((exposure(0.0, 1), Moment(0.0, 1)))
     around = [m.JointState(AT.stamp_ns + n, (m.INSERTION_JOINT,), (0.05,)) for n in (0, 1)]
     # With a known insertion, one pair is enough.
-    eyes.send([(item, AT) for item in (*around, seen, None)])
-    actions: list[Action] = [action for batch in arrived for action in batch[0].result()]
+    actions = [action for item in (*around, seen, None) for action in handle((item, AT))]
     sent = {action.topic: action.message for action in actions if isinstance(action, Publish)}
     assert {"stereo/left/image_raw", "stereo/right/camera_info"} <= sent.keys()
     assert sent["needle/tip"].position == pytest.approx(tuple(seen.T_rig_tip[:3, 3]), abs=5e-4)
-    eyes.close()
-    eyes.send([(None, AT)])
-    (lost,) = [batch for batch in arrived if isinstance(batch, PortChange)]
-    (port,) = (port for port in RemoteTracker().ports if port.name == VISION)
-    assert list(port.on_change(lost, AT)) == [Exit(1, lost.lost)]
-    assert "has ended" in lost.lost
 
 
-def test_fast_exposures_are_dropped_and_failures_raised() -> None:
+def test_fast_exposures_are_dropped_and_the_end_of_the_process_ends_the_tracker() -> None:
     tracker, seen = RemoteTracker(), exposure(0.0)
-    hand_on = {port.name: port.handler for port in tracker.ports}
+    ports = {port.name: port for port in tracker.ports}
     (row,), (timer,) = tracker.inputs, tracker.timers
     joints = m.JointState(AT.stamp_ns, (m.INSERTION_JOINT,), (0.0,))
-    sent = list(hand_on[CAMERAS]((seen, seen, seen), AT))
+    sent = list(ports[CAMERAS].handler((seen, seen, seen), AT))
     assert sent == [Send(VISION, ((seen, AT),))] * 2
     # Joint states and time are never dropped.
     sent = [*row.handler(joints, AT), *timer.handler(AT)]
     assert [action.batch[0][0] for action in sent if isinstance(action, Send)] == [joints, None]
-    assert list(hand_on[CAMERAS]((seen,), AT)) == []
+    assert list(ports[CAMERAS].handler((seen,), AT)) == []
     tip = Publish("needle/tip", m.Point(AT.stamp_ns, "rig", (0.0, 0.0, 0.0)))
-    done: vision.Done = Future()
-    done.set_result([tip])
-    assert list(hand_on[VISION]((done,), AT)) == [tip]
-    failed: vision.Done = Future()
-    failed.set_exception(ValueError("cannot see"))
-    with pytest.raises(ValueError, match="cannot see"):
-        list(hand_on[VISION]((failed,), AT))
-    assert len(list(hand_on[CAMERAS]((seen, seen, seen), AT))) == 2
+    assert list(ports[VISION].handler(([tip], []), AT)) == [tip]
+    assert len(list(ports[CAMERAS].handler((seen, seen, seen), AT))) == 2
+    assert list(ports[VISION].on_change(PortChange("ended"), AT)) == [Exit(1, "ended")]

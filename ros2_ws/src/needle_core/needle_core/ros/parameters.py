@@ -10,12 +10,11 @@ from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.msg import SetParametersResult as Result
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from needle_core.errors import UserError, did_you_mean
-from needle_core.settings.parameter_fields import ParameterSpec, specs
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import ParameterSpec, from_values, specs
 from needle_core.settings.parameter_files import check_command_line
 
 P = TypeVar("P")
@@ -48,40 +47,25 @@ class NodeParameters(Generic[P]):
         self, node: Node, parameters: type[P], on_change: Callable[[P], None] | None = None
     ) -> None:
         self._on_change = on_change
-        known = {name: (spec, default) for name, spec, default in specs(parameters)}
         for line in check_command_line(sys.argv, node.get_fully_qualified_name()):
             node.get_logger().warning(line)
-        _reject_unknown(node, list(known))
-        values: dict[str, Any] = {}
-        for name, (spec, default) in known.items():
+        # Checked here, because rclpy silently drops undeclared overrides: a misspelt gain would
+        # have no effect. The value of an empty list is None.
+        given = {
+            name: _plain(override.value)
+            for name, override in node._parameter_overrides.items()
+            if override.value is not None and not name.startswith(COMMON_PARAMETERS)
+        }
+        self.values = from_values(parameters, given, node.get_fully_qualified_name())
+        for name, spec, default in specs(parameters):
             value = list(default) if isinstance(default, tuple) else default
             # ROS cannot infer the type of an empty list; lists of texts are dynamically typed.
             empty = value == [] and not spec.texts
             if empty:
                 value = Parameter.Type.DOUBLE_ARRAY
-            try:
-                declared = node.declare_parameter(name, value, _descriptor(spec, default))
-                if empty and declared.value is None:
-                    node.set_parameters([Parameter(name, Parameter.Type.DOUBLE_ARRAY, [])])
-            except InvalidParameterTypeException as error:
-                given = node._parameter_overrides[name].value
-                whole = isinstance(default, float) and type(given) is int
-                raise UserError(
-                    f"{node.get_fully_qualified_name()}: {name} = {given!r} is not of type "
-                    f"{type(default).__name__}" + (f" (write {given}.0)" if whole else "")
-                ) from error
-            except InvalidParameterValueException as error:
-                given = node._parameter_overrides[name].value
-                sign = "" if spec.unit == "-" else f" {spec.unit}"
-                raise UserError(
-                    f"{node.get_fully_qualified_name()}: {name} = {given!r} is outside "
-                    f"[{spec.lower:g}, {spec.upper:g}]{sign}"
-                ) from error
-            values[name] = _plain(node.get_parameter(name).value)
-        try:
-            self.values: P = parameters(**values)
-        except UserError as error:
-            raise UserError(f"{node.get_fully_qualified_name()}: {error}") from error
+            declared = node.declare_parameter(name, value, _descriptor(spec, default))
+            if empty and declared.value is None:
+                node.set_parameters([Parameter(name, Parameter.Type.DOUBLE_ARRAY, [])])
         self._sim_time = bool(node.get_parameter(_SIM_TIME).value)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
@@ -112,16 +96,6 @@ class NodeParameters(Generic[P]):
 def _plain(value: Any) -> Any:
     """Return lists and arrays as tuples, other values unchanged."""
     return value if isinstance(value, (str, int, float, bool)) else tuple(value)
-
-
-def _reject_unknown(node: Node, known: list[str]) -> None:
-    # rclpy silently drops undeclared overrides: a misspelt gain would have no effect.
-    for name in node._parameter_overrides:
-        if name not in known and not name.startswith(COMMON_PARAMETERS):
-            hint = did_you_mean(name, known)
-            raise UserError(
-                f"{node.get_fully_qualified_name()}: unknown parameter '{name}' ({hint})"
-            )
 
 
 def _descriptor(spec: ParameterSpec, default: Any) -> ParameterDescriptor:

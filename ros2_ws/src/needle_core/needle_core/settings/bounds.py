@@ -21,14 +21,11 @@ class Bounds(NamedTuple):
         Inclusive bounds; an infinite value is rejected even if `upper` is infinite.
     unit : str
         Unit of the field, "-" for none.
-    unlimited : bool
-        Whether infinity is a valid value.
     """
 
     lower: float
     upper: float
     unit: str
-    unlimited: bool = False
 
 
 def check_bounds(
@@ -54,8 +51,7 @@ def check_bounded_fields(settings: Any) -> None:
     for name, bounds in _bounded_fields(settings.__class__):
         value = getattr(settings, name)
         if value is not None:
-            lower, upper, unit, unlimited = bounds
-            check_bounds(name, float(value), lower, upper, unit, unlimited=unlimited)
+            check_bounds(name, float(value), *bounds)
 
 
 @functools.cache

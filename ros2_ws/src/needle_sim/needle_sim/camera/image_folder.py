@@ -7,7 +7,6 @@ import csv
 import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TextIO
 
 import cv2
 import numpy as np
@@ -63,6 +62,34 @@ def truth_of(T_rig_tip: FloatArray, needle: NeedleShape | None = None) -> Truth:
     return Truth(np.array(T_rig_tip[:3, 3]), *angles)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class RenderedPair:
+    """Exposure of an insertion.
+
+    Attributes
+    ----------
+    number : int
+        Number of the exposure, which names its files.
+    images : pair of ndarray of uint8
+        Left and right image.
+    insertion : float
+        Insertion of the stage [m].
+    truth : Truth or None
+        Ground truth; None without a needle in the phantom.
+    visible_share : pair of float
+        Visible share of the needle's last 10 mm, in the left and the right image.
+    more : sequence of float or str
+        Values of the folder's additional columns.
+    """
+
+    number: int
+    images: tuple[GreyImage, GreyImage]
+    insertion: float
+    truth: Truth | None
+    visible_share: tuple[float, float]
+    more: Sequence[float | str] = ()
+
+
 class ImageFolder:
     """Writes left/NNNNNN.png, right/NNNNNN.png, calibration.yaml, insertion.csv and truth.csv.
 
@@ -93,65 +120,36 @@ class ImageFolder:
             (folder / "calibration.yaml").write_bytes(calibration)
             for side in ("left", "right"):
                 (folder / side).mkdir()
-            self._insertions = self._table("insertion.csv", _INSERTION_COLUMNS)
-            self._truths = self._table("truth.csv", _TRUTH_COLUMNS + more_columns)
+            self._add("insertion.csv", _INSERTION_COLUMNS)
+            self._add("truth.csv", _TRUTH_COLUMNS + more_columns)
 
-    def write(
-        self,
-        number: int,
-        images: tuple[GreyImage, GreyImage],
-        insertion: float,
-        truth: Truth | None,
-        visible_share: tuple[float, float],
-        *,
-        more: Sequence[float | str] = (),
-    ) -> None:
-        """Add an exposure.
-
-        Parameters
-        ----------
-        number : int
-            Number of the exposure, which names the files.
-        images : pair of ndarray of uint8
-            Left and right image.
-        insertion : float
-            Insertion of the stage [m].
-        truth : Truth or None
-            Ground truth; None without a needle: empty fields.
-        visible_share : pair of float
-            Visible share of the needle's last 10 mm, in the left and the right image.
-        more : sequence of float or str
-            Values of the additional columns.
+    def write(self, pair: RenderedPair) -> None:
+        """Add an exposure; its fields are empty without a needle.
 
         Raises
         ------
         UserError
             If a file cannot be written.
         """
-        name = f"{number:06d}.png"
+        name = f"{pair.number:06d}.png"
         values: list[float | str] = [""] * 7
-        if truth is not None:
+        if (truth := pair.truth) is not None:
             angles = (truth.pitch, truth.yaw, truth.shaft_pitch, truth.shaft_yaw)
             values = [*truth.tip.tolist(), *angles]
-        visible = [round(share, 3) for share in visible_share]
+        visible = [round(share, 3) for share in pair.visible_share]
         with self._reported_errors():
-            for side, image in zip(("left", "right"), images, strict=True):
+            for side, image in zip(("left", "right"), pair.images, strict=True):
                 data = cv2.imencode(".png", image, _PNG_OPTIONS)[1]
                 (self._folder / side / name).write_bytes(data.tobytes())
-            _add(self._insertions, [name, repr(float(insertion))])
+            self._add("insertion.csv", [name, repr(float(pair.insertion))])
             # repr() keeps all digits.
-            row = (v if isinstance(v, str) else repr(v) for v in (*values, *visible, *more))
-            _add(self._truths, [name, *row])
+            row = (v if isinstance(v, str) else repr(v) for v in (*values, *visible, *pair.more))
+            self._add("truth.csv", [name, *row])
 
-    def close(self) -> None:
-        """Close the tables, which are complete up to the last exposure at any time."""
-        self._insertions.close()
-        self._truths.close()
-
-    def _table(self, name: str, columns: tuple[str, ...]) -> TextIO:
-        stream = (self._folder / name).open("w", encoding="utf-8", newline="")
-        _add(stream, columns)
-        return stream
+    def _add(self, table: str, row: Sequence[str]) -> None:
+        """Add a row to a table, which is closed again: it is complete at any time."""
+        with (self._folder / table).open("a", encoding="utf-8", newline="") as stream:
+            csv.writer(stream, lineterminator="\n").writerow(row)
 
     @contextlib.contextmanager
     def _reported_errors(self) -> Iterator[None]:
@@ -159,8 +157,3 @@ class ImageFolder:
             yield
         except OSError as error:
             raise UserError(f"cannot write {self._folder}: {error.strerror}") from error
-
-
-def _add(stream: TextIO, row: Sequence[str]) -> None:
-    csv.writer(stream, lineterminator="\n").writerow(row)
-    stream.flush()

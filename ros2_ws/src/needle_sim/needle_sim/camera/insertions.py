@@ -8,11 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from needle_core.errors import UserError
-from needle_sim.camera.image_folder import Truth, truth_of
+from needle_sim.camera.image_folder import RenderedPair, truth_of
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import Scenario
 from needle_sim.camera.stereo_rig import StereoRig
-from needle_sim.camera.view import GreyImage
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
 
@@ -48,31 +47,6 @@ class RandomPath:
     pitch: float
     roll: float
     rotation: FloatArray
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class RenderedPair:
-    """Exposure of an insertion.
-
-    Attributes
-    ----------
-    number : int
-        Number of the exposure.
-    images : pair of ndarray of uint8
-        Left and right image.
-    insertion : float
-        Insertion of the stage [m].
-    truth : Truth or None
-        Ground truth; None without a needle in the phantom.
-    visible_share : pair of float
-        Visible share of the needle's last 10 mm, in the left and the right image.
-    """
-
-    number: int
-    images: tuple[GreyImage, GreyImage]
-    insertion: float
-    truth: Truth | None
-    visible_share: tuple[float, float]
 
 
 def random_path(

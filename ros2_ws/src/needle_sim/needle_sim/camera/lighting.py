@@ -17,7 +17,7 @@ _LENGTHS = (0.0, 0.140)
 _NEEDLE_SIDE = 0.006
 _NEEDLE_LENGTHS = (0.02, 0.115)
 _SLIMNESS = (0.12, 0.5)
-_FLICKER_PERIOD = 23.0
+_DRIFT_PERIOD, _FLICKER_PERIOD = 90.0, 23.0  # [exposures]
 _SHINE_LENGTHS = (0.0015, 0.0045)
 _SHINE = 160.0
 _BEND = 0.25
@@ -55,7 +55,7 @@ def uneven_light(
 
 def drift(lighting: Lighting, exposure_number: int, phase: float) -> float:
     """Return the factor by which an exposure's light drifts; `phase` is the initial one [rad]."""
-    angle = 2.0 * np.pi * exposure_number / lighting.drift_period + phase
+    angle = 2.0 * np.pi * exposure_number / _DRIFT_PERIOD + phase
     return float(1.0 + lighting.drift * np.sin(angle))
 
 

@@ -68,14 +68,11 @@ class Lighting:
         Relative darkness of a soft shade on one side.
     drift : float
         Relative amplitude of the light's drift.
-    drift_period : float
-        Period of the drift [exposures].
     """
 
     blotches: float
     shade: float
     drift: float
-    drift_period: float = 90.0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,14 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from needle_sim.camera.image_folder import truth_of
-from needle_sim.camera.insertions import (
-    CURVATURE,
-    RandomPath,
-    RenderedPair,
-    advance_to,
-    random_path,
-)
+from needle_sim.camera.image_folder import RenderedPair, Truth, truth_of
+from needle_sim.camera.insertions import CURVATURE, RandomPath, advance_to, random_path
 from needle_sim.camera.optics import Optics
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.needle.needle_shape import NeedleShape
@@ -45,7 +39,7 @@ class TracedPair(RenderedPair):
         Needle at the exposures of left and right; the right one may be inserted further.
     """
 
-    meshes: tuple[NeedleMesh, NeedleMesh] | None
+    meshes: tuple[NeedleMesh, NeedleMesh] | None = None
 
 
 def trace_insertion(
@@ -121,7 +115,10 @@ def trace_insertion(
                     for camera, points in zip(optics, distal, strict=True)
                 ]
             images = renderer.render(meshes, number)
-            yield TracedPair(number, images, insertion, truth, (visible[0], visible[1]), meshes)
+            more = _truth_values(appearance, truth, meshes)
+            yield TracedPair(
+                number, images, insertion, truth, (visible[0], visible[1]), more, meshes
+            )
 
     return pairs()
 
@@ -174,18 +171,19 @@ TRUTH_COLUMNS = (
 """Columns: end of the axis (the tip), foremost point of the metal, centre of the bevel, ..."""
 
 
-def truth_values(appearance: Appearance, pair: TracedPair) -> list[float | str]:
+def _truth_values(
+    appearance: Appearance, truth: Truth | None, meshes: tuple[NeedleMesh, NeedleMesh] | None
+) -> list[float | str]:
     """Return the values of `TRUTH_COLUMNS`; empty without a needle."""
-    metal = "" if pair.truth is None else appearance.metal
+    metal = "" if truth is None else appearance.metal
     scene = (appearance.lamps, appearance.floor, metal, appearance.bubbles)
-    if pair.truth is None or pair.meshes is None:
+    if truth is None or meshes is None:
         return [*[""] * 14, *scene]
-    truth = pair.truth
     heading = (
         np.sin(truth.pitch),
         -np.cos(truth.pitch) * np.sin(truth.yaw),
         np.cos(truth.pitch) * np.cos(truth.yaw),
     )
-    places = np.concatenate([truth.tip, pair.meshes[0].extreme, pair.meshes[0].face_middle])
+    places = np.concatenate([truth.tip, meshes[0].extreme, meshes[0].face_middle])
     values = [*places * MM, *heading, appearance.bevel_length * MM, appearance.diameter * MM]
     return [*(round(float(value), 6) for value in values), *scene]

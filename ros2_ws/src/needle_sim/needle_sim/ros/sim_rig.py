@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 
 from needle_core.component import RealPort
+from needle_core.ports.worker import Worker
 from needle_core.ros.main import run_component
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
@@ -39,9 +40,9 @@ def _make(settings: SimRigParameters, name: str) -> SimRig:
 def _ports(settings: SimRigParameters) -> Mapping[str, RealPort]:
     if settings.level == "tip":
         return {}
-    from needle_sim.cameras import CAMERAS, RenderingProcess  # noqa: PLC0415
+    from needle_sim.cameras import CAMERAS, make_renderer  # noqa: PLC0415
 
-    return {CAMERAS: RenderingProcess(settings)}
+    return {CAMERAS: Worker(make_renderer, settings)}
 
 
 def main() -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import math
 import sys
@@ -19,17 +18,12 @@ from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_js
 from needle_core.commands.options import CommandParser, number, output_file, whole_number
 from needle_core.errors import UserError
 from needle_core.files.installed import find_shared_file
-from needle_sim.camera.image_folder import ImageFolder
-from needle_sim.camera.insertions import CURVATURE, RenderedPair, render_insertion
+from needle_sim.camera.image_folder import ImageFolder, RenderedPair
+from needle_sim.camera.insertions import CURVATURE, render_insertion
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS, Scenario, find_scenario
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.path_traced.appearance import APPEARANCES, RANDOM, Appearance, draw_appearance
-from needle_sim.path_traced.insertion import (
-    TRUTH_COLUMNS,
-    TracedPair,
-    trace_insertion,
-    truth_values,
-)
+from needle_sim.path_traced.insertion import TRUTH_COLUMNS, trace_insertion
 from needle_sim.path_traced.tracer import load_mitsuba
 from needle_sim.sequences.boxes import draw_box
 
@@ -152,14 +146,10 @@ def _write(
         pairs = render_insertion(rig, look, seed=seed, **path)
     else:
         columns, pairs = TRUTH_COLUMNS, trace_insertion(load_mitsuba(), rig, look, **path)
-    with contextlib.closing(ImageFolder(output, calibration, columns)) as folder:
-        for pair in pairs:
-            more: Sequence[float | str] = ()
-            if isinstance(look, Appearance) and isinstance(pair, TracedPair):
-                more = truth_values(look, pair)
-            visible = pair.visible_share
-            folder.write(pair.number, pair.images, pair.insertion, pair.truth, visible, more=more)
-            yield
+    folder = ImageFolder(output, calibration, columns)
+    for pair in pairs:
+        folder.write(pair)
+        yield
 
 
 def _parser() -> CommandParser:

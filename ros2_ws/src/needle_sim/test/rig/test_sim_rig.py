@@ -8,11 +8,12 @@ from typing import Any
 import pytest
 
 from needle_core import messages as m
-from needle_core.component import Action, Moment, Publish
+from needle_core.component import Action, Exit, Moment, PortChange, Publish
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import from_values
 from needle_core.status_messages import ControllerStatus
 from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_sim.cameras import PublishedRemoteCameras
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
 
@@ -68,6 +69,16 @@ def test_at_level_drive_motors_move_the_needle_and_its_exit_triggers_the_stop() 
     truth = next(message for topic, message in published if topic == "sim/tip_pose")
     assert math.hypot(truth.position[0], truth.position[2]) == pytest.approx(0.001)
     assert [stop.pressed for topic, stop in published if topic == "device/estop"] == [True]
+
+
+def test_a_third_exposure_is_dropped_and_the_end_of_the_rendering_process_ends_the_rig() -> None:
+    rig = SimRig(SimRigParameters(), new_sensor=PublishedRemoteCameras)
+    (port,), at = rig.ports, Moment(0.0, 0)
+    images = [Publish("stereo/left/image_raw", m.Text("pixels"))]
+    assert [len(list(rig._sensor.expose(number, number))) for number in range(3)] == [1, 1, 0]
+    assert list(port.handler((images,), at)) == images
+    assert [len(list(rig._sensor.expose(number, number))) for number in range(3, 5)] == [1, 0]
+    assert list(port.on_change(PortChange("ended"), at)) == [Exit(1, "ended")]
 
 
 @pytest.mark.parametrize(
