@@ -41,7 +41,7 @@ class SearchSettings:
         Number of columns within which the ends of two shafts count as one.
     """
 
-    shafts: int = 20
+    shafts: int = 12
     late_start: float = -8.0
     path_limit: float = 12.0
     apart: int = 2
