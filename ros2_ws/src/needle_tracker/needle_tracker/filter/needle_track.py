@@ -324,7 +324,11 @@ class NeedleTrack:
         if self.insertion is None:
             no_end -= self.motion_log_odds
         others = _log_sum(-self.motion_log_odds, no_end)
-        return self.length_log_odds - _log_sum(others, -FILTER.shadow_log_odds)
+        shadow = -FILTER.shadow_log_odds
+        if self.insertion is not None:
+            # A shadow is about as long as its needle, other objects end at any distance.
+            shadow += FILTER.shadow_length
+        return self.length_log_odds - _log_sum(others, shadow)
 
     def rank(self) -> float:
         """Return the log-odds for comparison with other tracks, reduced by each miss."""

@@ -22,6 +22,8 @@ class FilterSettings:
         pair [1/m^3]: once per metre along the needle, within 0.3 mm across.
     shadow_log_odds : float
         Log-odds of a needle against its own shadow or mirror image.
+    shadow_length : float
+        Log-odds of the length of a shadow, within 10 % of that of its needle, against any distance.
     length_sigma : float
         Standard deviation of the length of the shaft [m], from path-traced pairs.
     prior_log_odds : float
@@ -51,6 +53,7 @@ class FilterSettings:
     free_step: float = 4.0e-3
     chance_density: float = 1.8e6
     shadow_log_odds: float = 3.0
+    shadow_length: float = 2.5
     length_sigma: float = 0.4e-3
     prior_log_odds: float = -1.0
     evidence_length: float = 10e-3
