@@ -24,7 +24,7 @@ from needle_tracker.calibrating.rig_fit import (
     misfit_px,
 )
 from needle_tracker.calibrating.rig_model import (
-    CAMERA_PARAMETERS,
+    FIRST_WINDOW,
     LENS,
     RigModel,
     camera_slice,
@@ -128,7 +128,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     """
     views = [checked_view(view) for view in views]
     model = RigModel(calibration, views, initial_board_poses(calibration, views))
-    causes = (*CAMERAS, *model.names[CAMERA_PARAMETERS:])
+    causes = (*CAMERAS, *model.names[FIRST_WINDOW:])
     everything = _fit(model, list(causes), None)
     sigma = everything.corner_sigma_px
     misfit = misfit_px(model, everything)

@@ -87,11 +87,6 @@ class BoardView:
         left, right = (nothing if s == side else self.corners(s) for s in SIDES)
         return dataclasses.replace(self, left=left, right=right)
 
-    def scaled(self, size: float) -> BoardView:
-        """Return the view of a board that is larger by a factor."""
-        left, right = (Corners(size * c.points, c.pixels) for c in (self.left, self.right))
-        return dataclasses.replace(self, left=left, right=right)
-
     @property
     def under_surface(self) -> bool:
         """Whether the board was in the phantom."""

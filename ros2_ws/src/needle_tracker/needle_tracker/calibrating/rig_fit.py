@@ -101,19 +101,6 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
     return RigFit(parameters, free.copy(), covariance, residuals, sigma, cost)
 
 
-def outlier_weights(whitened: Array) -> Array:
-    """Return the weights of residuals in standard deviations (soft L1)."""
-    return np.asarray(1.0 / np.sqrt(1.0 + (whitened / _OUTLIER) ** 2))
-
-
-def given_rows(model: RigModel, free: Mask) -> Array:
-    """Return the rows of the priors in the whitened Jacobian, (n, free)."""
-    rows, sigmas = _priors(model, free)
-    result = np.zeros((len(rows), int(np.count_nonzero(free))))
-    result[np.arange(len(rows)), np.searchsorted(np.flatnonzero(free), rows)] = 1.0 / sigmas
-    return result
-
-
 def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, float]]:
     """Return the deviations of boards from places with a standard deviation.
 
@@ -196,7 +183,7 @@ def _minimize(
     cost, pixels = cost_of(parameters)
     normal = np.zeros((0, 0))
     for _ in range(_ITERATIONS):
-        weights = outlier_weights(pixels)
+        weights = 1.0 / np.sqrt(1.0 + (pixels / _OUTLIER) ** 2)
         slopes = np.nan_to_num(model.jacobian(parameters, free) / sigma)
         weighted = slopes * weights[:, None]
         normal, gradient = weighted.T @ slopes, weighted.T @ pixels
