@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_core.commands.cli import JsonValue
+from needle_core.commands.csv_files import read_lengths
 from needle_tracker.answers.annotation import IN_ENTRY_ZONE, missing, shows_end, shows_shaft
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.optics.calibration import SIDES
-from needle_tracker.sources.image_files import read_numbers
 
 Array = npt.NDArray[np.float64]
 
@@ -148,7 +148,7 @@ def read_truth(path: Path) -> dict[str, Array | None]:
     Raises
     ------
     UserError
-        As `image_files.read_numbers`.
+        As `read_lengths`.
     """
-    read = read_numbers("--truth", path, ("x_m", "y_m", "z_m"))
+    read = read_lengths(path, ("x_m", "y_m", "z_m"))
     return {name: None if tip is None else np.array(tip) for name, tip in read.items()}

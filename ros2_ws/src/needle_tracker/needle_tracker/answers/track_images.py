@@ -10,13 +10,13 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_core.commands.options import CommandParser, number, output_file
+from needle_core.commands.csv_files import read_insertions
+from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
 from needle_core.files.file_access import write_text
 from needle_core.settings.parameter_fields import from_values
@@ -33,7 +33,6 @@ from needle_tracker.sources.image_files import (
     Sizes,
     open_pairs,
     progress,
-    read_insertions,
 )
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
@@ -160,18 +159,14 @@ def _run(given: argparse.Namespace) -> int:
 
 
 def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
-    """Return the parameters of the node: defaults, --params, and the width of the needle."""
-    changes: dict[str, Any] = {}
-    if given.params is not None:
-        sections = read_sections(Path(given.params))
-        values = values_for(given.params, sections, f"/{_NODE}", _NODE)
-        if values is None:
-            _warn(missing_section_warning(given.params, sections, f"/{_NODE}"))
-        changes |= values or {}
-    if given.needle_width_mm is not None:
-        width = number("--needle-width-mm", given.needle_width_mm, 0.2, 3.0, "mm")
-        changes["needle_width"] = 1e-3 * width
-    return from_values(StereoTrackerParameters, changes, _NODE)
+    """Return the parameters of the node: defaults, and those of --params."""
+    if given.params is None:
+        return StereoTrackerParameters()
+    sections = read_sections(Path(given.params))
+    values = values_for(given.params, sections, f"/{_NODE}", _NODE)
+    if values is None:
+        _warn(missing_section_warning(given.params, sections, f"/{_NODE}"))
+    return from_values(StereoTrackerParameters, values or {}, _NODE)
 
 
 def track(
@@ -269,7 +264,6 @@ def _parser() -> CommandParser:
         "render_images): print the errors in mm and in standard deviations",
     )
     add("--params", metavar="FILE", help="ROS parameter file with stereo_tracker's parameters")
-    add("--needle-width-mm", metavar="W", help="diameter of the needle [mm] (default: 0.7)")
     add("--json", metavar="FILE", help="also write the figures as flat JSON")
     return parser
 
