@@ -195,14 +195,12 @@ def _columns(model: RigModel, cause: str) -> list[int]:
 def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
     columns = _columns(model, cause)
     change = (best.parameters - model.start)[columns]
-    size = float(change[0])
-    sigma = float(best.sigma[columns[0]])
+    length = float(np.linalg.norm(change))
+    towards = change / max(length, 1e-12)
+    sigma = float(np.sqrt(towards @ best.covariance[np.ix_(columns, columns)] @ towards))
+    size = length if cause in CAMERAS else float(change[0])
     alone = model.start.copy()
     alone[columns] = best.parameters[columns]
-    if cause in CAMERAS:
-        size = float(np.linalg.norm(change))
-        towards = change / max(size, 1e-12)
-        sigma = float(np.sqrt(towards @ best.covariance[np.ix_(columns, columns)] @ towards))
     error = _p95(model.calibration(model.start), model.calibration(alone))
     return Deviation(cause, size, sigma, error)
 

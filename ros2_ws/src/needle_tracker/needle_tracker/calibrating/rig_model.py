@@ -96,6 +96,9 @@ class RigModel:
         Number of shared parameters.
     start : ndarray, shape (p,)
         Initial parameters.
+    given_sigma : ndarray, shape (p,)
+        Standard deviations of the initial parameters as given: 0 for the board at an exact place,
+        infinite for an unknown parameter.
     """
 
     def __init__(
@@ -129,6 +132,9 @@ class RigModel:
         if self._surface is not None:
             height = self._surface.point[0]
             self.start[FIRST_WINDOW : self.shared] = self._surface.inside, height
+        windows_sigma = [WINDOW.get(name.split(".")[-1], np.inf) for name in self.names]
+        boards_sigma = [_place_sigma(view) for view in views]
+        self.given_sigma = np.concatenate([windows_sigma, *boards_sigma])
         names = [*self.names, *POSE * len(views)]
         self._steps = np.array([_STEPS[name.split(".")[-1][0]] for name in names])
 
@@ -225,6 +231,15 @@ class RigModel:
         return dataclasses.replace(
             window, point=window.point + offset * window.normal, normal=turned
         )
+
+
+def _place_sigma(view: BoardView) -> Array:
+    """Return the standard deviations of the place of a board, shape (6,) [rad, m]."""
+    if view.place is None or not view.place.is_known:
+        return np.full(6, np.inf)
+    # The sigma of the rotation follows from that of the board's edges.
+    reach = max(float(np.ptp(view.left.points[:, :2], axis=0).max()), 1e-3)
+    return view.place.sigma * np.repeat([2.0 / reach, 1.0], 3)
 
 
 def needle_points(calibration: StereoCalibration) -> Array:

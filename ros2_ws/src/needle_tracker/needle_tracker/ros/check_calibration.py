@@ -25,7 +25,6 @@ from needle_core.process.discovery import restrict_discovery
 from needle_core.process.shared_memory import remove_incomplete_ports
 from needle_core.ros.base_node import IMAGES_BEST_EFFORT, WholeNode
 from needle_core.settings.bounds import check_bounds
-from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.answers.tracker_messages import frame_of
 from needle_tracker.calibrating.calibration_check import check, figures, report
 from needle_tracker.calibrating.calibration_session import (
@@ -144,17 +143,17 @@ def _live_pairs(
 ) -> list[dict[str, np.ndarray]]:
     """Receive image pairs; raise a `UserError` for images of other cameras, or too few."""
     node = WholeNode("check_calibration", context=context)
-    matcher: PairMatcher[Frame] = PairMatcher(round(1e9 * options.pair_tolerance))
+    matcher: PairMatcher[np.ndarray] = PairMatcher(round(1e9 * options.pair_tolerance))
     pairs: list[dict[str, np.ndarray]] = []
 
     def receive(side: str, message: Image) -> None:
         frame = frame_of(message, side, calibration.cameras[side])
         if frame.pixels is None:
             raise UserError(frame.problem)
-        image = frame.pixels.copy()
-        pair = matcher.add(side, to_nanoseconds(message.header.stamp), Frame(image))
-        if pair is not None and pair.left.pixels is not None and pair.right.pixels is not None:
-            pairs.append({"left": pair.left.pixels, "right": pair.right.pixels})
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        pair = matcher.add(side, stamp_ns, frame.pixels.copy())
+        if pair is not None:
+            pairs.append({"left": pair.left, "right": pair.right})
 
     for side in SIDES:
         on_image = partial(receive, side)
