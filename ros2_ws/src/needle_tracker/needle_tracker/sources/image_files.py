@@ -176,7 +176,6 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
         names = [f"{index:06d}" for index in range(max(min(counts), 0))]
         return PairSequence(names, [], left, right, None)
     one_folder = left.samefile(right)
-    left, right = _image_folder(left), _image_folder(right)
     found = [_images_in(side, path) for side, path in zip(_SIDES, (left, right), strict=True)]
     pairs = sorted(_pair(*found, one_folder=one_folder), key=lambda pair: _natural(pair[0]))
     if not pairs:
@@ -257,13 +256,6 @@ def _partners(name: str) -> Iterator[tuple[str, str]]:
             kept = [part.strip(_SEPARATORS) for part in around]
             shared = ("_" if kept != list(around) else "").join(filter(None, kept)) or stem
             yield around[0] + word + around[1] + suffix, shared + suffix
-
-
-def _image_folder(folder: Path) -> Path:
-    """Return the folder of the images: the folder itself or its `data`, as in EuRoC and Kalibr."""
-    inner = folder / "data"
-    has_images = any(path.suffix.lower() in _SUFFIXES for path in folder.iterdir())
-    return inner if inner.is_dir() and not has_images else folder
 
 
 def _images_in(side: str, folder: Path) -> set[str]:
