@@ -111,7 +111,8 @@ def _view(image: Image, end: ImageEnd | None, believed: bool) -> Image:
     if end is not None:
         colour = _RED if not believed else _GREEN if shows_end(end) else _YELLOW
         line = np.stack([end.point - _SHAFT_PX * end.direction, end.point])
-        pixels = np.rint(np.clip((line + 0.5) * _SCALE - 0.5, -1e4, 1e4)).astype(int).tolist()
-        cv2.line(view, *pixels, colour, 1, cv2.LINE_AA)
-        cv2.circle(view, pixels[1], 5, colour, 1, cv2.LINE_AA)
+        small_line = np.clip((line + 0.5) * _SCALE - 0.5, -1e4, 1e4)
+        start, tip = np.rint(small_line).astype(int).tolist()
+        cv2.line(view, start, tip, colour, 1, cv2.LINE_AA)
+        cv2.circle(view, tip, 5, colour, 1, cv2.LINE_AA)
     return np.asarray(view, dtype=np.uint8)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_core.commands.csv_files import read_insertions
+from needle_core.commands.csv_files import read_insertions, read_lengths
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
 from needle_core.files.file_access import write_text
@@ -23,7 +23,7 @@ from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import missing_section_warning, read_sections, values_for
 from needle_tracker.answers.annotation import annotate, missing
 from needle_tracker.answers.pair_answers import SUSPICION, SwapWatch
-from needle_tracker.answers.run_summary import DetectionCounts, TruthComparison, read_truth
+from needle_tracker.answers.run_summary import DetectionCounts, TruthComparison
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
@@ -99,7 +99,8 @@ def _run(given: argparse.Namespace) -> int:
     calibration = load_calibration(Path(given.calibration))
     insertions = read_insertions(Path(given.insertion)) if given.insertion else {}
     pairs = open_pairs(Path(given.left), Path(given.right))
-    truth = TruthComparison(read_truth(Path(given.truth)) if given.truth else {})
+    true = read_lengths(Path(given.truth), ("x_m", "y_m", "z_m")) if given.truth else {}
+    truth = TruthComparison(true)
     overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
     tracker = NeedleTracker(calibration, parameters, parameters.reference(calibration.sizes))
     tracker.warm_up()
