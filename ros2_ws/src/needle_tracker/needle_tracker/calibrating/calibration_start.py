@@ -325,8 +325,8 @@ def _apart(views: list[BoardView], cameras: StereoCalibration) -> tuple[list[str
 def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[list[str], Array]:
     """Return the names of the views that contradict the others, and T_right_left of the others.
 
-    The consistent set starts with the view whose relative pose is closest to that of half of all
-    views, and grows until it no longer changes.
+    The consistent set starts with the view whose relative pose is closest to that of a quarter of
+    all views, and grows until it no longer changes.
     """
     left, right = (
         initial_board_poses(cameras, [view.without(other) for view in views])
@@ -335,9 +335,10 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
     limits = 2.0 * _alone(cameras, views) + _SLACK_PX
     poses = right @ np.linalg.inv(left)
     away = np.linalg.norm((poses[:, None] @ left - right)[..., :3, 3], axis=-1)
-    typical = np.median(away, axis=1)
-    best = int(np.argmin(typical))
-    pose, near = poses[best], away[best] <= 3.0 * typical[best]
+    quarter = min(max(len(views) // 4, 1), len(views) - 1)
+    nearest = np.sort(away, axis=1)[:, quarter]
+    best = int(np.argmin(nearest))
+    pose, near = poses[best], away[best] <= 3.0 * nearest[best]
     for _ in range(_ROUNDS):
         kept = [view for view, is_near in zip(views, near, strict=True) if is_near]
         model = RigModel(_posed(cameras, pose), kept, left[near])
