@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_bringup.training.traced_scenes import TracedScene, shaft_share
+from needle_core.commands.csv_files import read_insertions
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
-from needle_tracker.sources.image_files import open_pairs, read_insertions
+from needle_tracker.sources.image_files import open_pairs
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]

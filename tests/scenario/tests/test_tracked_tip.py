@@ -26,6 +26,7 @@ from needle_core.runners.virtual import DIAGNOSTICS, VirtualRunner
 from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import Sensor
 from needle_sim.sim_rig_parameters import SimRigParameters
+from needle_tracker.optics.calibration import pose_matrix
 from needle_tracker.tracked.registration import Registration
 from needle_tracker.tracked_tip import TrackedTip, TrackedTipParameters
 from plus_messages import message, transform_message
@@ -33,9 +34,15 @@ from scenario.parts.simulated_tracker import PLACE, TURN, SimulatedTracker, Trac
 
 Spoil = Callable[[int, np.ndarray, float], bytes]
 OPERATOR = SimulatedOperator.name
+
+
+def moved(turn: Rotation, place: np.ndarray) -> Registration:
+    """Return the exact registration with another T_rig_tracker."""
+    return dataclasses.replace(EXACT, T_rig_tracker=pose_matrix(turn.as_matrix(), place))
+
+
 EXACT = Registration(
-    translation=PLACE,
-    quaternion=TURN.as_quat(),
+    T_rig_tracker=pose_matrix(TURN.as_matrix(), PLACE),
     centroid=np.array([0.0, 0.0, 0.05]),
     covariance=np.diag([1e-8] * 3 + [1e-6] * 3),
     tip_offset=np.zeros(3),
@@ -43,7 +50,7 @@ EXACT = Registration(
 )
 WRONG_BY = np.array([0.6e-3, -0.5e-3, 0.62e-3])
 WRONG = dataclasses.replace(
-    EXACT, translation=PLACE + WRONG_BY, covariance=np.diag([0.33e-6] * 3 + [2.5e-5] * 3)
+    moved(TURN, PLACE + WRONG_BY), covariance=np.diag([0.33e-6] * 3 + [2.5e-5] * 3)
 )
 BEHIND = dataclasses.replace(EXACT, tip_offset=np.array([0.0, 0.0, 8e-3]))
 
@@ -286,17 +293,9 @@ def advance_after(spoil: Spoil) -> float:
 
 QUARTER = Rotation.from_euler("y", 90.0, degrees=True)
 BAD_REGISTRATIONS = {
-    "10 mm off": (dataclasses.replace(EXACT, translation=PLACE + 6e-3), "out_of_range"),
-    "w first": (
-        dataclasses.replace(EXACT, quaternion=np.roll(EXACT.quaternion, 1)),
-        "out_of_range",
-    ),
-    "turned about the entry": (
-        dataclasses.replace(
-            EXACT, translation=QUARTER.apply(PLACE), quaternion=(QUARTER * TURN).as_quat()
-        ),
-        "heading",
-    ),
+    "10 mm off": (moved(TURN, PLACE + 6e-3), "out_of_range"),
+    "w first": (moved(Rotation.from_quat(np.roll(TURN.as_quat(), 1)), PLACE), "out_of_range"),
+    "turned about the entry": (moved(QUARTER * TURN, QUARTER.apply(PLACE)), "heading"),
 }
 
 

@@ -151,9 +151,9 @@ class TrackedTip(Component):
             return "no_joint_states", f"none within {_MAX_AGE:g} s of the measurement"
         speed = 0.0 if before is None else (insertion - before) / _SPEED_SPAN
         # p = R_rig_tracker (R_tracker_sensor offset + t) + t_rig_tracker
-        turn, rotation = registration.rotation, transform.matrix[:3, :3]
+        turn, rotation = registration.T_rig_tracker[:3, :3], transform.matrix[:3, :3]
         tip = rotation @ registration.tip_offset + _UNITS[settings.unit] * transform.matrix[:3, 3]
-        position = turn @ tip + registration.translation
+        position = turn @ tip + registration.T_rig_tracker[:3, 3]
         heading = turn @ rotation @ _AXES[settings.heading_axis]
         turned = settings.heading_std**2 * np.eye(3) + registration.covariance[3:, 3:]
         if settings.heading_axis == "none":

@@ -153,9 +153,9 @@ def test_pairs_are_requested_at_the_rate_until_the_camera_is_lost(
 
 
 def test_a_thread_reads_the_source() -> None:
-    source, arrived = mock.Mock(), queue.SimpleQueue[Any]()
+    source, arrived = mock.MagicMock(), queue.SimpleQueue[Any]()
     given = (EndOfRecording("all"), None, UserError("unplugged?"), ZeroDivisionError())
-    source.next.side_effect = given
+    source.__next__ = mock.Mock(side_effect=given)
     port = PairPort(source)
     port.open(arrived.put)
     for _ in given:

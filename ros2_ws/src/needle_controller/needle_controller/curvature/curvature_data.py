@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from needle_controller.model.arrays import Array
+from needle_core.commands.csv_files import read_insertions, read_rows
 from needle_core.commands.options import number
 from needle_core.errors import UserError
-from needle_core.files.yaml_files import read_text
 from needle_core.message_types import to_nanoseconds
 
 _COORDINATES = ("x_m", "y_m", "z_m")
@@ -119,24 +117,18 @@ def read_record(path: Path, insertion_file: Path | None = None) -> InsertionReco
 
 def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
     """Read a CSV of tips; see `read_record`."""
-    rows = _rows(path)
+    of_name = None if insertion_file is None else read_insertions(insertion_file)
+    rows = read_rows(path, _COORDINATES if of_name is None else ("name", *_COORDINATES))
     if not rows:
         raise UserError(f"{path}: the file has no rows")
     columns = set(rows[0][1])
-    missing = [name for name in _COORDINATES if name not in columns]
-    if missing:
-        there = ", ".join(sorted(columns))
-        raise UserError(f"{path}: column {missing[0]} is missing (has {there})")
-    of_name = None if insertion_file is None else _insertions(insertion_file)
-    if of_name is not None and "name" not in columns:
-        raise UserError(f"{path}: column name is missing; --insertion needs it")
     tips, insertion, rotation = [], [], []
-    for line, row in rows:
-        if row.get("valid", "1").strip() in ("0", "false", "False"):
+    for where, row in rows:
+        if row.get("valid", "1") in ("0", "false", "False"):
             continue
-        if all(not row[name].strip() for name in _COORDINATES):
+        if all(not row[name] for name in _COORDINATES):
             continue
-        tips.append([_number(path, line, row, name) for name in _COORDINATES])
+        tips.append([_number(where, row, name) for name in _COORDINATES])
         if of_name is not None:
             # By the image's name with or without its suffix, as in `track_images`.
             length = of_name.get(row["name"], of_name.get(Path(row["name"]).stem))
@@ -144,9 +136,9 @@ def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
                 raise UserError(f"{insertion_file}: no insertion for {row['name']}")
             insertion.append(length)
         elif "insertion_m" in columns:
-            insertion.append(_number(path, line, row, "insertion_m"))
+            insertion.append(_number(where, row, "insertion_m"))
         if "rotation_rad" in columns:
-            rotation.append(_number(path, line, row, "rotation_rad"))
+            rotation.append(_number(where, row, "rotation_rad"))
     return InsertionRecord(
         np.array(tips, dtype=float).reshape(-1, 3),
         np.array(insertion) if insertion else None,
@@ -204,7 +196,7 @@ def _read_tip(path: Path, message: Any, tips: dict[int, list[float]]) -> None:
 
 
 def _read_joints(message: Any, joints: dict[int, list[float]]) -> None:
-    position: Mapping[str, float] = dict(zip(message.name, message.position, strict=False))
+    position: dict[str, float] = dict(zip(message.name, message.position, strict=False))
     if "insertion_joint" in position and "rotation_joint" in position:
         joints.setdefault(
             to_nanoseconds(message.header.stamp),
@@ -212,29 +204,7 @@ def _read_joints(message: Any, joints: dict[int, list[float]]) -> None:
         )
 
 
-def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
-    """Return (line number, column to text) of every row."""
-    reader, rows = csv.DictReader(read_text(path).splitlines(), restval=""), []
-    for row in reader:
-        if None in row:
-            raise UserError(f"{path}:{reader.line_num}: more fields than columns")
-        rows.append((reader.line_num, {k.strip(): v for k, v in row.items()}))
-    return rows
-
-
-def _insertions(path: Path) -> dict[str, float]:
-    rows = _rows(path)
-    for column in ("name", "insertion_m"):
-        if rows and column not in rows[0][1]:
-            raise UserError(f"{path}: column {column} is missing")
-    return {
-        row["name"]: _number(path, line, row, "insertion_m")
-        for line, row in rows
-        if row["insertion_m"].strip()
-    }
-
-
-def _number(path: Path, line: int, row: Mapping[str, str], name: str) -> float:
+def _number(where: str, row: dict[str, str], name: str) -> float:
     unit = name.rpartition("_")[2]
     largest = _LARGEST[unit]
-    return number(f"{path}:{line}: {name}", row[name].strip(), -largest, largest, unit)
+    return number(f"{where}: {name}", row[name], -largest, largest, unit)

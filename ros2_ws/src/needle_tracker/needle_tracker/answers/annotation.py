@@ -25,7 +25,6 @@ _BY_VIEWS = {
 _SCALE = 0.5
 _GREEN, _YELLOW, _RED = (90, 230, 90), (255, 220, 60), (255, 80, 60)
 _SHAFT_PX = 40.0
-_SHIFT = 4  # fractional bits of coordinates for drawing
 _CAPTION_PX = 44
 
 
@@ -112,13 +111,8 @@ def _view(image: Image, end: ImageEnd | None, believed: bool) -> Image:
     if end is not None:
         colour = _RED if not believed else _GREEN if shows_end(end) else _YELLOW
         line = np.stack([end.point - _SHAFT_PX * end.direction, end.point])
-        cv2.polylines(view, [_fixed(line)], False, colour, 1, cv2.LINE_AA, _SHIFT)
-        u, v = (int(part) for part in _fixed(end.point[None])[0, 0])
-        cv2.circle(view, (u, v), 5 << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
+        small_line = np.clip((line + 0.5) * _SCALE - 0.5, -1e4, 1e4)
+        start, tip = np.rint(small_line).astype(int).tolist()
+        cv2.line(view, start, tip, colour, 1, cv2.LINE_AA)
+        cv2.circle(view, tip, 5, colour, 1, cv2.LINE_AA)
     return np.asarray(view, dtype=np.uint8)
-
-
-def _fixed(points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Convert points in the full image to fixed-point coordinates in the small one."""
-    small = (points + 0.5) * _SCALE - 0.5
-    return np.round(np.clip(small, -1e4, 1e4) * (1 << _SHIFT)).astype(np.int32).reshape(-1, 1, 2)

@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +14,6 @@ from needle_core.commands.cli import JsonValue
 from needle_tracker.answers.annotation import IN_ENTRY_ZONE, missing, shows_end, shows_shaft
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.optics.calibration import SIDES
-from needle_tracker.sources.image_files import read_numbers
 
 Array = npt.NDArray[np.float64]
 
@@ -67,11 +65,11 @@ class TruthComparison:
 
     Parameters
     ----------
-    tips : mapping of str to (ndarray, shape (3,), or None)
+    tips : mapping of str to (sequence of 3 floats, or None)
         True tip in `rig` [m] by name; None if the images show no needle.
     """
 
-    def __init__(self, tips: Mapping[str, Array | None]) -> None:
+    def __init__(self, tips: Mapping[str, Sequence[float] | None]) -> None:
         self._tips = tips
         self._errors: list[Array] = []
         self._squares: list[float] = []
@@ -130,25 +128,3 @@ class TruthComparison:
                 f"{figures['inside_95']:.1%} lie within the claimed 95 % region",
             ]
         return "\n".join(lines)
-
-
-def read_truth(path: Path) -> dict[str, Array | None]:
-    """Read a CSV of true tips by name, with the columns name, x_m, y_m, z_m.
-
-    Parameters
-    ----------
-    path : Path
-        File as written by `render_images`; other columns are ignored.
-
-    Returns
-    -------
-    dict
-        Tip in `rig` [m] by name; None if the fields are empty, since there is no needle.
-
-    Raises
-    ------
-    UserError
-        As `image_files.read_numbers`.
-    """
-    read = read_numbers("--truth", path, ("x_m", "y_m", "z_m"))
-    return {name: None if tip is None else np.array(tip) for name, tip in read.items()}

@@ -10,20 +10,20 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_core.commands.options import CommandParser, number, output_file
+from needle_core.commands.csv_files import read_insertions, read_lengths
+from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
 from needle_core.files.file_access import write_text
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import missing_section_warning, read_sections, values_for
 from needle_tracker.answers.annotation import annotate, missing
 from needle_tracker.answers.pair_answers import SUSPICION, SwapWatch
-from needle_tracker.answers.run_summary import DetectionCounts, TruthComparison, read_truth
+from needle_tracker.answers.run_summary import DetectionCounts, TruthComparison
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
@@ -33,7 +33,6 @@ from needle_tracker.sources.image_files import (
     Sizes,
     open_pairs,
     progress,
-    read_insertions,
 )
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
@@ -100,7 +99,8 @@ def _run(given: argparse.Namespace) -> int:
     calibration = load_calibration(Path(given.calibration))
     insertions = read_insertions(Path(given.insertion)) if given.insertion else {}
     pairs = open_pairs(Path(given.left), Path(given.right))
-    truth = TruthComparison(read_truth(Path(given.truth)) if given.truth else {})
+    true = read_lengths(Path(given.truth), ("x_m", "y_m", "z_m")) if given.truth else {}
+    truth = TruthComparison(true)
     overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
     tracker = NeedleTracker(calibration, parameters, parameters.reference(calibration.sizes))
     tracker.warm_up()
@@ -160,18 +160,14 @@ def _run(given: argparse.Namespace) -> int:
 
 
 def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
-    """Return the parameters of the node: defaults, --params, and the width of the needle."""
-    changes: dict[str, Any] = {}
-    if given.params is not None:
-        sections = read_sections(Path(given.params))
-        values = values_for(given.params, sections, f"/{_NODE}", _NODE)
-        if values is None:
-            _warn(missing_section_warning(given.params, sections, f"/{_NODE}"))
-        changes |= values or {}
-    if given.needle_width_mm is not None:
-        width = number("--needle-width-mm", given.needle_width_mm, 0.2, 3.0, "mm")
-        changes["needle_width"] = 1e-3 * width
-    return from_values(StereoTrackerParameters, changes, _NODE)
+    """Return the parameters of the node: defaults, and those of --params."""
+    if given.params is None:
+        return StereoTrackerParameters()
+    sections = read_sections(Path(given.params))
+    values = values_for(given.params, sections, f"/{_NODE}", _NODE)
+    if values is None:
+        _warn(missing_section_warning(given.params, sections, f"/{_NODE}"))
+    return from_values(StereoTrackerParameters, values or {}, _NODE)
 
 
 def track(
@@ -269,7 +265,6 @@ def _parser() -> CommandParser:
         "render_images): print the errors in mm and in standard deviations",
     )
     add("--params", metavar="FILE", help="ROS parameter file with stereo_tracker's parameters")
-    add("--needle-width-mm", metavar="W", help="diameter of the needle [mm] (default: 0.7)")
     add("--json", metavar="FILE", help="also write the figures as flat JSON")
     return parser
 

@@ -20,7 +20,7 @@ from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
 from needle_core.files.file_access import write_text
 from needle_core.settings.bounds import ABOVE_0, check_bounds
-from needle_tracker.calibrating.calibration_outliers import contradictions, misfits, square_error
+from needle_tracker.calibrating.calibration_outliers import contradictions, misfits
 from needle_tracker.calibrating.calibration_session import (
     KINDS,
     load_session,
@@ -114,9 +114,8 @@ def _run(options: Namespace) -> int:
         if options.json is not None:
             write_json(options.json, {"problem": str(error)})
         return EXIT_MISSED
-    size = square_error(result)
-    problems = contradictions(result, size)
-    lines = [*report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
+    problems = contradictions(result)
+    lines = [*report(result, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
     print("\n".join(lines))
     save_calibration(options.output, result.calibration, lines)
     save_figure(rig_figure(result), options.output.with_suffix(".rig.png"), 130)
@@ -139,7 +138,7 @@ def reprojection_by_kind(result: RigCalibration) -> dict[tuple[str, str], float]
     }
 
 
-def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) -> list[str]:
+def report(result: RigCalibration, goal_mm: float) -> list[str]:
     """Return a calibration as lines of text."""
     kinds = [view.kind for view in result.model.views]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in KINDS)
@@ -159,7 +158,7 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
         value, sigma, unit = scale * found.value, scale * found.sigma, unit and f" {unit}"
         kept = f" (NOT DETERMINED by these views, kept as given: {value:g}{unit})"
         lines.append(f"{name}: {value:.5g}{unit} +- {sigma:.2g}{unit}{kept if found.kept else ''}")
-    error, sigma = (100.0 * value for value in size)
+    error, sigma = (100.0 * value for value in result.square_error)
     if sigma < _SCALE_KNOWN:
         lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % relative to the session")
     else:

@@ -24,7 +24,7 @@ from needle_tracker.calibrating.rig_fit import (
     misfit_px,
 )
 from needle_tracker.calibrating.rig_model import (
-    CAMERA_PARAMETERS,
+    FIRST_WINDOW,
     LENS,
     RigModel,
     camera_slice,
@@ -128,7 +128,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     """
     views = [checked_view(view) for view in views]
     model = RigModel(calibration, views, initial_board_poses(calibration, views))
-    causes = (*CAMERAS, *model.names[CAMERA_PARAMETERS:])
+    causes = (*CAMERAS, *model.names[FIRST_WINDOW:])
     everything = _fit(model, list(causes), None)
     sigma = everything.corner_sigma_px
     misfit = misfit_px(model, everything)
@@ -195,14 +195,12 @@ def _columns(model: RigModel, cause: str) -> list[int]:
 def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
     columns = _columns(model, cause)
     change = (best.parameters - model.start)[columns]
-    size = float(change[0])
-    sigma = float(best.sigma[columns[0]])
+    length = float(np.linalg.norm(change))
+    towards = change / max(length, 1e-12)
+    sigma = float(np.sqrt(towards @ best.covariance[np.ix_(columns, columns)] @ towards))
+    size = length if cause in CAMERAS else float(change[0])
     alone = model.start.copy()
     alone[columns] = best.parameters[columns]
-    if cause in CAMERAS:
-        size = float(np.linalg.norm(change))
-        towards = change / max(size, 1e-12)
-        sigma = float(np.sqrt(towards @ best.covariance[np.ix_(columns, columns)] @ towards))
     error = _p95(model.calibration(model.start), model.calibration(alone))
     return Deviation(cause, size, sigma, error)
 

@@ -15,13 +15,9 @@ from needle_tracker.calibrating.calibration_start import describe_apart
 from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.calibrating.rig_fit import (
     LARGEST_MISFIT_PX,
-    LEAST_CORNER_SIGMA_PX,
-    given_rows,
     misfit_px,
-    outlier_weights,
     place_deviations,
 )
-from needle_tracker.calibrating.rig_model import RigModel
 from needle_tracker.optics.calibration import SIDES
 
 Array = NDArray[np.float64]
@@ -31,19 +27,15 @@ LARGEST_SCALE_ERROR = 1e-3  # of the squares: 0.13 mm at the tip
 _RINGS = 10
 _RING_SIGMAS = 5.0  # 3.4 at most in 8 x 40 simulated sessions of lenses without a pattern
 _LEAST_PATTERN_PX = 0.02
-_LEAST_SHARE = 1e-9  # least effect of the size on the corners beyond other parameters: rounding
-_SIZE_STEP = 1e-4  # step of the derivative with respect to the size of the squares
 
 
-def contradictions(result: RigCalibration, size: tuple[float, float]) -> list[str]:
+def contradictions(result: RigCalibration) -> list[str]:
     """Return the contradictions in a session as text; empty if consistent.
 
     Parameters
     ----------
     result : RigCalibration
         The calibration.
-    size : (float, float)
-        Result of `square_error`.
     """
     found = [text for view, text in misfits(result) if view.place is not None]
     if any(view.place is not None for view in result.apart):
@@ -61,7 +53,7 @@ def contradictions(result: RigCalibration, size: tuple[float, float]) -> list[st
             f"corners are off by {misfit:.2f} px for an unknown reason: a board that is "
             "not flat, another lens, focus or image size than given"
         )
-    error, sigma = size
+    error, sigma = result.square_error
     if abs(error) > max(LARGEST_SCALE_ERROR, LARGEST_PULL * sigma):
         found.append(
             f"the squares measure {100 * abs(error):.2f} +- {100 * sigma:.2f} % "
@@ -124,43 +116,3 @@ def ring_patterns(result: RigCalibration) -> dict[str, float]:
         if np.any((np.abs(means) > _RING_SIGMAS * errors) & (np.abs(means) > _LEAST_PATTERN_PX)):
             found[side] = float(np.abs(means).max())
     return found
-
-
-def square_error(result: RigCalibration) -> tuple[float, float]:
-    """Return the relative error of the size of the squares, and its standard deviation.
-
-    The size is an additional parameter of the fit, in one Gauss-Newton step. Only boards at known
-    places determine it: a larger board held freely would look the same from farther away.
-
-    Parameters
-    ----------
-    result : RigCalibration
-        The calibration.
-
-    Returns
-    -------
-    error, sigma : float
-        True size divided by the given size, minus 1; sigma is infinite if undetermined.
-    """
-    model, fitted = result.model, result.fit
-    poses = model.board_poses(fitted.parameters)
-    missed = []
-    for size in (1.0 + _SIZE_STEP, 1.0 - _SIZE_STEP):
-        views = [view.scaled(size) for view in model.views]
-        scaled = RigModel(result.calibration, views, poses)
-        missed.append(scaled.residuals(scaled.start))
-    by_size = (missed[0] - missed[1]) / (2.0 * _SIZE_STEP)
-
-    sigma_px = max(fitted.corner_sigma_px, LEAST_CORNER_SIGMA_PX)
-    whitened = fitted.residuals / sigma_px
-    roots = np.sqrt(outlier_weights(whitened)) / sigma_px
-    others = model.jacobian(fitted.parameters, fitted.free) * roots[:, None]
-    prior_rows = given_rows(model, fitted.free)
-    lengths = np.maximum(np.linalg.norm(others, axis=0), 1e-12)
-    matrix = np.concatenate([others, prior_rows]) / lengths
-    target = np.concatenate([by_size * roots, np.zeros(len(prior_rows))])
-    alone = (target - matrix @ np.linalg.lstsq(matrix, target, rcond=1e-13)[0])[: len(roots)]
-    information = float(alone @ alone)
-    if information <= _LEAST_SHARE * float(target @ target):
-        return 0.0, np.inf
-    return -float(alone @ (roots * fitted.residuals)) / information, information**-0.5

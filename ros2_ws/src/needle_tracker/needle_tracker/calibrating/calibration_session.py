@@ -87,11 +87,6 @@ class BoardView:
         left, right = (nothing if s == side else self.corners(s) for s in SIDES)
         return dataclasses.replace(self, left=left, right=right)
 
-    def scaled(self, size: float) -> BoardView:
-        """Return the view of a board that is larger by a factor."""
-        left, right = (Corners(size * c.points, c.pixels) for c in (self.left, self.right))
-        return dataclasses.replace(self, left=left, right=right)
-
     @property
     def under_surface(self) -> bool:
         """Whether the board was in the phantom."""
@@ -307,8 +302,7 @@ def views_in_folders(
                     f"{path} is {size[0]}x{size[1]}, the {side} images before it "
                     f"are {sizes[side][0]}x{sizes[side][1]}"
                 )
-            numbers, pixels = session.board.find(image)
-            corners.append(Corners(session.board.corners[numbers], pixels))
+            corners.append(_corners_in(image, session.board))
         names = [Path(path).stem for path in (pair.name, *pair.files)]
         views.append(BoardView(names[0], session.place_of(*names), *corners))
     if all(no_board_detected(view) for view in views):
@@ -326,7 +320,7 @@ def no_board_detected(view: BoardView) -> bool:
 
 
 def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) -> BoardView:
-    """Return the view of a board at rest, averaged over several exposures.
+    """Return the view of a board at rest, from the mean of several exposures.
 
     Parameters
     ----------
@@ -337,20 +331,20 @@ def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) ->
     pairs : list of dict of str to ndarray
         Left and right images.
     """
-    corners = []
-    for side in SIDES:
-        found: dict[int, list[Array]] = {}
-        for images in pairs:
-            for corner, pixel in zip(*session.board.find(images[side]), strict=True):
-                found.setdefault(int(corner), []).append(pixel)
-        # A corner that is missing in many exposures is unreliable.
-        kept = sorted(n for n, pixels in found.items() if 2 * len(pixels) > len(pairs))
-        pixels = np.array([np.mean(found[n], axis=0) for n in kept]).reshape(-1, 2)
-        corners.append(Corners(session.board.corners[kept], pixels))
+    left, right = (
+        np.rint(np.mean([images[side] for images in pairs], axis=0)).astype(np.uint8)
+        for side in SIDES
+    )
+    corners = (_corners_in(image, session.board) for image in (left, right))
     view = BoardView(name, session.place_of(name), *corners)
     if no_board_detected(view):
         raise _no_board(session)
     return view
+
+
+def _corners_in(image: Image, board: CharucoBoard) -> Corners:
+    numbers, pixels = board.find(image)
+    return Corners(board.corners[numbers], pixels)
 
 
 def _no_board(session: Session) -> UserError:

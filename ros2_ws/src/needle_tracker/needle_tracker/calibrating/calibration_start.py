@@ -326,7 +326,7 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
     """Return the names of the views that contradict the others, and T_right_left of the others.
 
     The consistent set starts with the view whose relative pose is closest to that of a quarter of
-    all views, or else of one other view, and grows until it no longer changes.
+    all views, and grows until it no longer changes.
     """
     left, right = (
         initial_board_poses(cameras, [view.without(other) for view in views])
@@ -335,24 +335,20 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
     limits = 2.0 * _alone(cameras, views) + _SLACK_PX
     poses = right @ np.linalg.inv(left)
     away = np.linalg.norm((poses[:, None] @ left - right)[..., :3, 3], axis=-1)
-    for others in (max(len(views) // 4, 1), 1):
-        nearest = np.sort(away, axis=1)[:, min(others, len(views) - 1)]
-        best = int(np.argmin(nearest))
-        pose, near = poses[best], away[best] <= 3.0 * nearest[best]
-        for _ in range(_ROUNDS):
-            kept = [view for view, is_near in zip(views, near, strict=True) if is_near]
-            model = RigModel(_posed(cameras, pose), kept, left[near])
-            free = board_parameters_free(model)
-            free[camera_slice("right")][len(LENS) :] = True
-            parameters = fit(model, model.start, free).parameters
-            pose = model.calibration(parameters).right.T_optical_rig
-            was, near = near, _misses(_posed(cameras, pose), views) <= limits
-            if np.array_equal(near, was) or not np.any(near):
-                break
-        if np.count_nonzero(near) > min(others, len(views) - 1):
+    quarter = min(max(len(views) // 4, 1), len(views) - 1)
+    nearest = np.sort(away, axis=1)[:, quarter]
+    best = int(np.argmin(nearest))
+    pose, near = poses[best], away[best] <= 3.0 * nearest[best]
+    for _ in range(_ROUNDS):
+        kept = [view for view, is_near in zip(views, near, strict=True) if is_near]
+        model = RigModel(_posed(cameras, pose), kept, left[near])
+        free = board_parameters_free(model)
+        free[camera_slice("right")][len(LENS) :] = True
+        parameters = fit(model, model.start, free).parameters
+        pose = model.calibration(parameters).right.T_optical_rig
+        was, near = near, _misses(_posed(cameras, pose), views) <= limits
+        if np.array_equal(near, was) or not np.any(near):
             break
-    else:
-        near[:] = False
     return [view.name for view, is_near in zip(views, near, strict=True) if not is_near], pose
 
 

@@ -21,11 +21,17 @@ from needle_tracker.calibrating.calibration_start import (
     consistent_views,
     first_calibration,
 )
-from needle_tracker.calibrating.rig_fit import RigFit, board_parameters_free, fit
+from needle_tracker.calibrating.rig_fit import (
+    LEAST_CORNER_SIGMA_PX,
+    RigFit,
+    board_parameters_free,
+    fit,
+)
 from needle_tracker.calibrating.rig_model import (
-    CAMERA_PARAMETERS,
+    FIRST_WINDOW,
     LENS,
     POSE,
+    SQUARES,
     RigModel,
     camera_slice,
     tip_error_p95,
@@ -82,6 +88,10 @@ class RigCalibration:
         Fitted model.
     parameters : dict of str to Determined
         By name: `left.fx` ... `right.k3`, and those of the windows (`RigModel.names`).
+    square_error : (float, float)
+        True size of the squares divided by the given one, minus 1, and its standard deviation. Only
+        boards at known places determine it: a larger board held freely would look the same from
+        farther away.
     tip_error_p95 : float
         Expected 95 % error of tips in the phantom from this calibration alone [m].
     apart : list of BoardView
@@ -92,6 +102,7 @@ class RigCalibration:
     fit: RigFit
     model: RigModel
     parameters: dict[str, Determined]
+    square_error: tuple[float, float]
     tip_error_p95: float
     apart: list[BoardView]
 
@@ -164,10 +175,11 @@ def calibrate(
     poses[: model.shared] = [name.split(".")[-1] in POSE for name in names]
     poses[camera_slice("right")] &= not tied
     free[: model.shared] = True
+    free[SQUARES] = False
     if lenses is not None:
-        free[:CAMERA_PARAMETERS] = poses[:CAMERA_PARAMETERS]
+        free[:FIRST_WINDOW] = poses[:FIRST_WINDOW]
     if not any(view.under_surface for view in views):
-        free[CAMERA_PARAMETERS : model.shared] = False
+        free[FIRST_WINDOW : model.shared] = False
     sigmas = dict.fromkeys(names, np.inf)
     parameters = model.start
     if start.surface is None:
@@ -192,11 +204,15 @@ def calibrate(
     determined = {
         name: Determined(float(result.parameters[i]), float(sigmas[name]), not free[i])
         for i, name in enumerate(names)
-        if i >= CAMERA_PARAMETERS or (lenses is None and name.split(".")[-1] in LENS)
+        if i >= FIRST_WINDOW or (lenses is None and name.split(".")[-1] in LENS)
     }
     shared = result.covariance[: model.shared, : model.shared]
     tip_error = tip_error_p95(calibration, shared, tied=tied)
-    return RigCalibration(calibration, result, model, determined, tip_error, apart)
+    free[SQUARES] = True
+    corner_sigma = max(result.corner_sigma_px, LEAST_CORNER_SIGMA_PX)
+    other = fit(model, result.parameters, free, corner_sigma)
+    size = float(other.parameters[SQUARES]), float(other.sigma[SQUARES])
+    return RigCalibration(calibration, result, model, determined, size, tip_error, apart)
 
 
 def _check_relative_pose(given: Array, found: Array) -> None:

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.calibrating.rig_model import WINDOW, RigModel
+from needle_tracker.calibrating.rig_model import RigModel
 from needle_tracker.optics.calibration import SIDES
 
 Array = NDArray[np.float64]
@@ -57,11 +57,8 @@ class RigFit:
 
 def board_parameters_free(model: RigModel) -> Mask:
     """Return the mask of unknown board parameters: all but those of exact places."""
-    free = np.zeros(len(model.start), dtype=bool)
-    for number, view in enumerate(model.views):
-        if view.place is None or view.place.sigma > 0.0:
-            first = model.shared + 6 * number
-            free[first : first + 6] = True
+    free = model.given_sigma > 0.0
+    free[: model.shared] = False
     return free
 
 
@@ -86,32 +83,17 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
     RigFit
         The fit.
     """
-    start = np.array(start)
-    priors = _priors(model, free)
-    parameters, normal, cost = _minimize(model, start, free, corner_sigma_px or 0.3, priors)
+    parameters, normal, cost = _minimize(model, start, free, corner_sigma_px or 0.3)
     residuals = model.residuals(parameters)
     sigma = corner_sigma_px
     if sigma is None:
-        weighed = max(_spread(residuals, free, priors), LEAST_CORNER_SIGMA_PX)
-        parameters, normal, cost = _minimize(model, parameters, free, weighed, priors)
+        weighed = max(_spread(model, residuals, free), LEAST_CORNER_SIGMA_PX)
+        parameters, normal, cost = _minimize(model, parameters, free, weighed)
         residuals = model.residuals(parameters)
-        sigma = _spread(residuals, free, priors)
+        sigma = _spread(model, residuals, free)
     covariance = np.zeros((len(start), len(start)))
     covariance[np.ix_(free, free)] = _inverse_normal(normal)
     return RigFit(parameters, free.copy(), covariance, residuals, sigma, cost)
-
-
-def outlier_weights(whitened: Array) -> Array:
-    """Return the weights of residuals in standard deviations (soft L1)."""
-    return np.asarray(1.0 / np.sqrt(1.0 + (whitened / _OUTLIER) ** 2))
-
-
-def given_rows(model: RigModel, free: Mask) -> Array:
-    """Return the rows of the priors in the whitened Jacobian, (n, free)."""
-    rows, sigmas = _priors(model, free)
-    result = np.zeros((len(rows), int(np.count_nonzero(free))))
-    result[np.arange(len(rows)), np.searchsorted(np.flatnonzero(free), rows)] = 1.0 / sigmas
-    return result
 
 
 def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, float]]:
@@ -130,18 +112,15 @@ def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, 
         Name of the view; deviation of the centre of the board [m]; the largest deviation of its six
         parameters in standard deviations.
     """
-    rows, sigmas = _place_priors(model, result.free)
-    numbers = (rows.reshape(-1, 6)[:, 0] - model.shared) // 6
     poses = model.board_poses(result.parameters)
     deviations = []
-    for number, pulls in zip(
-        numbers.tolist(), (result.parameters[rows] / sigmas).reshape(-1, 6), strict=True
-    ):
-        view = model.views[number]
-        assert view.place is not None
-        middle = np.append(view.left.points.mean(axis=0), 1.0)
-        away = (poses[number] - view.place.T_rig_board) @ middle
-        deviations.append((view.name, float(np.linalg.norm(away)), float(np.abs(pulls).max())))
+    for number, view in enumerate(model.views):
+        if view.place is not None and 0.0 < view.place.sigma < np.inf:
+            own = slice(model.shared + 6 * number, model.shared + 6 * (number + 1))
+            pull = np.abs(result.parameters[own] / model.given_sigma[own]).max()
+            middle = np.append(view.left.points.mean(axis=0), 1.0)
+            away = np.linalg.norm((poses[number] - view.place.T_rig_board) @ middle)
+            deviations.append((view.name, float(away), float(pull)))
     return deviations
 
 
@@ -175,7 +154,7 @@ def misfit_px(model: RigModel, result: RigFit) -> float:
 
 
 def _minimize(
-    model: RigModel, start: Array, free: Mask, sigma: float, priors: tuple[NDArray[np.intp], Array]
+    model: RigModel, start: Array, free: Mask, sigma: float
 ) -> tuple[Array, Array, float]:
     """Return parameters, normal matrix at them, and cost.
 
@@ -183,25 +162,23 @@ def _minimize(
     `least_squares` takes a minute instead of seconds, since it decomposes the whole Jacobian
     (8,000 x 150) in every step.
     """
-    rows, place_sigma = priors
-    prior_columns = np.searchsorted(np.flatnonzero(free), rows)
+    # Inverse variances of the given values; 0 where nothing is given.
+    given = model.given_sigma[free] ** -2.0
 
     def cost_of(parameters: Array) -> tuple[float, Array]:
         pixels = np.nan_to_num(model.residuals(parameters) / sigma, nan=1e4)
-        prior = parameters[rows] / place_sigma
         robust = 2.0 * _OUTLIER**2 * (np.sqrt(1.0 + (pixels / _OUTLIER) ** 2) - 1.0)
-        return float(0.5 * (robust.sum() + prior @ prior)), pixels
+        return float(0.5 * (robust.sum() + given @ parameters[free] ** 2)), pixels
 
     parameters, damping = start.copy(), 1e-6
     cost, pixels = cost_of(parameters)
     normal = np.zeros((0, 0))
     for _ in range(_ITERATIONS):
-        weights = outlier_weights(pixels)
+        weights = 1.0 / np.sqrt(1.0 + (pixels / _OUTLIER) ** 2)
         slopes = np.nan_to_num(model.jacobian(parameters, free) / sigma)
         weighted = slopes * weights[:, None]
-        normal, gradient = weighted.T @ slopes, weighted.T @ pixels
-        normal[prior_columns, prior_columns] += 1.0 / place_sigma**2
-        gradient[prior_columns] += parameters[rows] / place_sigma**2
+        normal = weighted.T @ slopes + np.diag(given)
+        gradient = weighted.T @ pixels + given * parameters[free]
         better = False
         while not better and damping < _LARGEST_DAMPING:
             trial = parameters.copy()
@@ -227,39 +204,14 @@ def _solve(normal: Array, gradient: Array, damping: float) -> Array:
     return np.asarray(np.linalg.lstsq(scaled, gradient / scale, rcond=1e-15)[0] / scale)
 
 
-def _priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
-    """Return the indices of the parameters with priors, and the standard deviations."""
-    rows, sigmas = _place_priors(model, free)
-    window_sigmas = np.array([WINDOW.get(name.split(".")[-1], 0.0) for name in model.names])
-    window_rows = np.flatnonzero((window_sigmas > 0.0) & free[: model.shared])
-    return np.append(window_rows, rows), np.append(window_sigmas[window_rows], sigmas)
-
-
-def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
-    """Return the indices of the parameters of known places, and their sigmas [rad or m]."""
-    rows: list[int] = []
-    sigmas: list[float] = []
-    for number, view in enumerate(model.views):
-        if view.place is None or not 0.0 < view.place.sigma < np.inf:
-            continue
-        first = model.shared + 6 * number
-        if not free[first]:
-            continue
-        # The sigma of the rotation follows from that of the board's edges.
-        reach = max(float(np.ptp(view.left.points[:, :2], axis=0).max()), 1e-3)
-        rows += range(first, first + 6)
-        sigmas += [view.place.sigma * 2.0 / reach] * 3 + [view.place.sigma] * 3
-    return np.array(rows, dtype=np.intp), np.array(sigmas)
-
-
-def _spread(residuals: Array, free: Mask, priors: tuple[NDArray[np.intp], Array]) -> float:
+def _spread(model: RigModel, residuals: Array, free: Mask) -> float:
     """Return the standard deviation of the residuals of a fit, without outliers."""
     if not residuals.size:
         return 0.0
     rough = 1.4826 * float(np.median(np.abs(residuals)))
-    spare = residuals.size - int(np.count_nonzero(free)) + len(priors[0])
+    unknown = int(np.count_nonzero(np.isinf(model.given_sigma[free])))
     squares = residuals[np.abs(residuals) <= 4.0 * rough] ** 2
-    return float(np.sqrt(np.mean(squares) * residuals.size / max(spare, 1)))
+    return float(np.sqrt(np.mean(squares) * residuals.size / max(residuals.size - unknown, 1)))
 
 
 def _inverse_normal(normal: Array) -> Array:

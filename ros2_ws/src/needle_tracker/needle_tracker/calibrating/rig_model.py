@@ -4,7 +4,8 @@ Calibration and check share this model and its estimate of tip errors in the pha
 calibration, the two rays still meet, but elsewhere. The model's parameters are one vector:
 
     left: fx fy cx cy k1 k2 p1 p2 k3, rotation (3), translation (3); right: likewise;
-    windows; for each view of the board: rotation (3), translation (3).
+    error of the size of the squares; windows; for each view of the board: rotation (3),
+    translation (3).
 
 The window parameters are the refractive index and height of a common surface, or else, for each
 window, its offset along the normal and its tilts about two axes perpendicular to it; layers and
@@ -46,7 +47,8 @@ SURFACE = ("refractive_index", "surface_height")
 # Standard deviations of a given window, as measured with a ruler and a level [m, rad].
 WINDOW = {"window_offset": 2e-3, "window_tilt_1": 0.02, "window_tilt_2": 0.02}
 _CAMERA = len(LENS) + len(POSE)
-CAMERA_PARAMETERS = 2 * _CAMERA
+SQUARES = 2 * _CAMERA
+FIRST_WINDOW = SQUARES + 1
 # Steps of the central differences, whose relative error is about 1e-6.
 _STEPS = {"f": 0.1, "c": 0.1, "k": 1e-4, "p": 1e-4, "r": 1e-5, "t": 1e-5, "s": 1e-5, "w": 1e-5}
 
@@ -94,6 +96,9 @@ class RigModel:
         Number of shared parameters.
     start : ndarray, shape (p,)
         Initial parameters.
+    given_sigma : ndarray, shape (p,)
+        Standard deviations of the initial parameters as given: 0 for the board at an exact place,
+        infinite for an unknown parameter.
     """
 
     def __init__(
@@ -104,9 +109,10 @@ class RigModel:
         self._start = start.cameras
         self._windows = (start.left.window, start.right.window)
         self._surface = start.surface
-        self.names = tuple(f"{side}.{name}" for side in SIDES for name in LENS + POSE)
+        cameras = tuple(f"{side}.{name}" for side in SIDES for name in LENS + POSE)
         own = tuple(f"{side}.{name}" for side in SIDES for name in WINDOW)
-        self.names += own if self._surface is None else SURFACE
+        windows = own if self._surface is None else SURFACE
+        self.names = (*cameras, "square_size", *windows)
         self.shared = len(self.names)
         self._boards = np.asarray(boards, dtype=np.float64).reshape(-1, 4, 4)
         self._points = {s: np.concatenate([v.corners(s).points for v in views]) for s in SIDES}
@@ -125,7 +131,10 @@ class RigModel:
             self.start[camera_slice(side)][: len(LENS)] = lens
         if self._surface is not None:
             height = self._surface.point[0]
-            self.start[CAMERA_PARAMETERS : self.shared] = self._surface.inside, height
+            self.start[FIRST_WINDOW : self.shared] = self._surface.inside, height
+        windows_sigma = [WINDOW.get(name.split(".")[-1], np.inf) for name in self.names]
+        boards_sigma = [_place_sigma(view) for view in views]
+        self.given_sigma = np.concatenate([windows_sigma, *boards_sigma])
         names = [*self.names, *POSE * len(views)]
         self._steps = np.array([_STEPS[name.split(".")[-1][0]] for name in names])
 
@@ -152,7 +161,7 @@ class RigModel:
         camera, under = self._camera(parameters, side), self._under[side]
         boards, transform = self.board_poses(parameters)[self.view_of[side]], camera.T_optical_rig
         corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side])
-        corners += boards[:, :3, 3]
+        corners = (1.0 + parameters[SQUARES]) * corners + boards[:, :3, 3]
         optical = corners @ transform[:3, :3].T + transform[:3, 3]
         if np.any(under):
             optical[under] = RefractedCamera(camera).apparent_points(corners[under])
@@ -174,7 +183,7 @@ class RigModel:
             first = 0 if side == "left" else count["left"]
             rows = slice(first, first + count[side])
             cameras = range(0 if self.tied else camera_slice(side).start, camera_slice(side).stop)
-            for column in [*cameras, *range(CAMERA_PARAMETERS, self.shared)]:
+            for column in [*cameras, *range(SQUARES, self.shared)]:
                 if free[column]:
                     slopes = self._slopes(parameters, side, np.array([column]))
                     result[rows, column] = -slopes.ravel()
@@ -208,7 +217,7 @@ class RigModel:
         fx, fy, cx, cy = own[:4]
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         transform = self._transform(parameters, side)
-        window = self._window(parameters[CAMERA_PARAMETERS : self.shared], SIDES.index(side))
+        window = self._window(parameters[FIRST_WINDOW : self.shared], SIDES.index(side))
         return Camera(start.width, start.height, matrix, own[4:9].copy(), transform, window)
 
     def _window(self, parameters: Array, number: int) -> Window:
@@ -222,6 +231,15 @@ class RigModel:
         return dataclasses.replace(
             window, point=window.point + offset * window.normal, normal=turned
         )
+
+
+def _place_sigma(view: BoardView) -> Array:
+    """Return the standard deviations of the place of a board, shape (6,) [rad, m]."""
+    if view.place is None or not view.place.is_known:
+        return np.full(6, np.inf)
+    # The sigma of the rotation follows from that of the board's edges.
+    reach = max(float(np.ptp(view.left.points[:, :2], axis=0).max()), 1e-3)
+    return view.place.sigma * np.repeat([2.0 / reach, 1.0], 3)
 
 
 def needle_points(calibration: StereoCalibration) -> Array:

@@ -25,7 +25,6 @@ from needle_core.process.discovery import restrict_discovery
 from needle_core.process.shared_memory import remove_incomplete_ports
 from needle_core.ros.base_node import IMAGES_BEST_EFFORT, WholeNode
 from needle_core.settings.bounds import check_bounds
-from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.answers.tracker_messages import frame_of
 from needle_tracker.calibrating.calibration_check import check, figures, report
 from needle_tracker.calibrating.calibration_session import (
@@ -60,6 +59,7 @@ examples:
 exit codes: 0 OK; 1 NOT OK, or this target cannot show it; 2 invalid input, no images or no board;
 130 interrupted
 """  # noqa: E501 - command lines stay whole
+_LIVE_PAIRS, _TIMEOUT = 10, 10.0  # pairs that are averaged, and the wait for them [s]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -79,9 +79,6 @@ def parse(arguments: Sequence[str]) -> Namespace:
     given = _parser().parse_args(arguments)
     if len({given.left is None, given.right is None, given.live is not None}) > 1:
         raise UserError("give either --left and --right, or --live; see --help")
-    check_bounds("--count", given.count, 1, 1000, "pairs")
-    check_bounds("--timeout", given.timeout, 0.1, 3600.0, "s")
-    check_bounds("--pair-tolerance", given.pair_tolerance, 0.0, 0.1, "s")
     check_bounds("--limit-mm", given.limit_mm, 0.001, 10.0, "mm")
     given.limit = 1e-3 * given.limit_mm
     return given
@@ -95,9 +92,6 @@ def _parser() -> CommandParser:
     add("--left", type=Path, metavar="DIR", help="images of the left camera")
     add("--right", type=Path, metavar="DIR", help="images of the right camera")
     add("--live", metavar="NAME", help="use images from topics, the board at this place")
-    add("--count", type=int, default=10, metavar="N", help="number of live pairs (10)")
-    add("--timeout", type=float, default=10.0, metavar="S", help="wait for live pairs (10 s)")
-    add("--pair-tolerance", type=float, default=0.0, metavar="S", help="of left and right (0 s)")
     add("--limit-mm", type=float, default=0.15, metavar="MM", help="accepted tip error (0.15)")
     add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")
     return parser
@@ -133,41 +127,40 @@ def _live_view(
     remove_incomplete_ports()
     rclpy.init(args=words, context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        pairs = _live_pairs(context, calibration, options)
+        pairs = _live_pairs(context, calibration)
     finally:
         rclpy.try_shutdown(context=context)
     return averaged_view(name, session, pairs)
 
 
-def _live_pairs(
-    context: Context, calibration: StereoCalibration, options: Namespace
-) -> list[dict[str, np.ndarray]]:
+def _live_pairs(context: Context, calibration: StereoCalibration) -> list[dict[str, np.ndarray]]:
     """Receive image pairs; raise a `UserError` for images of other cameras, or too few."""
     node = WholeNode("check_calibration", context=context)
-    matcher: PairMatcher[Frame] = PairMatcher(round(1e9 * options.pair_tolerance))
+    # The board is at rest: images of cameras without a trigger may be half a frame apart.
+    matcher: PairMatcher[np.ndarray] = PairMatcher(None)
     pairs: list[dict[str, np.ndarray]] = []
 
     def receive(side: str, message: Image) -> None:
         frame = frame_of(message, side, calibration.cameras[side])
         if frame.pixels is None:
             raise UserError(frame.problem)
-        image = frame.pixels.copy()
-        pair = matcher.add(side, to_nanoseconds(message.header.stamp), Frame(image))
-        if pair is not None and pair.left.pixels is not None and pair.right.pixels is not None:
-            pairs.append({"left": pair.left.pixels, "right": pair.right.pixels})
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        pair = matcher.add(side, stamp_ns, frame.pixels.copy())
+        if pair is not None:
+            pairs.append({"left": pair.left, "right": pair.right})
 
     for side in SIDES:
         on_image = partial(receive, side)
         node.create_subscription(Image, f"stereo/{side}/image_raw", on_image, IMAGES_BEST_EFFORT)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    end = time.monotonic() + options.timeout
+    end = time.monotonic() + _TIMEOUT
     try:
-        while len(pairs) < options.count:
+        while len(pairs) < _LIVE_PAIRS:
             left = end - time.monotonic()
             if left <= 0.0:
                 raise UserError(
-                    f"{len(pairs)} image pairs of {options.count} in {options.timeout:g} s on "
+                    f"{len(pairs)} image pairs of {_LIVE_PAIRS} in {_TIMEOUT:g} s on "
                     f"stereo/{{left,right}}/image_raw (without a partner: "
                     f"{matcher.unpaired.total()})"
                 )

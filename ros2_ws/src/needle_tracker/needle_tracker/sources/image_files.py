@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import itertools
 import re
@@ -15,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from needle_core.commands.options import number
 from needle_core.errors import UserError
 
 Image = NDArray[np.uint8]
@@ -178,7 +176,6 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
         names = [f"{index:06d}" for index in range(max(min(counts), 0))]
         return PairSequence(names, [], left, right, None)
     one_folder = left.samefile(right)
-    left, right = _image_folder(left), _image_folder(right)
     found = [_images_in(side, path) for side, path in zip(_SIDES, (left, right), strict=True)]
     pairs = sorted(_pair(*found, one_folder=one_folder), key=lambda pair: _natural(pair[0]))
     if not pairs:
@@ -259,84 +256,6 @@ def _partners(name: str) -> Iterator[tuple[str, str]]:
             kept = [part.strip(_SEPARATORS) for part in around]
             shared = ("_" if kept != list(around) else "").join(filter(None, kept)) or stem
             yield around[0] + word + around[1] + suffix, shared + suffix
-
-
-def read_insertions(path: Path) -> Mapping[str, float]:
-    """Read a CSV of insertions by name, with the columns `name` and `insertion_m`.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    mapping
-        Insertion [m] by name, without names that have no value.
-
-    Raises
-    ------
-    UserError
-        As `read_numbers`.
-    """
-    read = read_numbers("--insertion", path, ("insertion_m",))
-    return {name: values[0] for name, values in read.items() if values is not None}
-
-
-def read_numbers(
-    option: str, path: Path, columns: tuple[str, ...]
-) -> dict[str, list[float] | None]:
-    """Read a CSV of numbers by name.
-
-    Parameters
-    ----------
-    option : str
-        Option of the file, for messages.
-    path : Path
-        The file.
-    columns : tuple of str
-        Columns besides `name`; others are ignored.
-
-    Returns
-    -------
-    dict
-        Numbers of the columns by name; None if all of these fields are empty.
-
-    Raises
-    ------
-    UserError
-        Unreadable, a column missing, a value that is not a finite number, or a duplicate name.
-    """
-    found: dict[str, list[float] | None] = {}
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            for column in ("name", *columns):
-                if column not in (rows.fieldnames or []):
-                    raise UserError(f"{option} {path}: no column {column!r} in its first line")
-            for row in rows:
-                where = f"{option} {path}, line {rows.line_num}"
-                name, *texts = ((row[column] or "").strip() for column in ("name", *columns))
-                if name in found:
-                    raise UserError(f"{where}: {name!r} is a duplicate")
-                values = zip(columns, texts, strict=True)
-                found[name] = (
-                    [number(f"{where}: {c}", text, -10.0, 10.0, "m") for c, text in values]
-                    if any(texts)
-                    else None
-                )
-    except OSError as error:
-        raise UserError(f"{option} {path}: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{option} {path} is not a CSV file: {error}") from error
-    return found
-
-
-def _image_folder(folder: Path) -> Path:
-    """Return the folder of the images: the folder itself or its `data`, as in EuRoC and Kalibr."""
-    inner = folder / "data"
-    has_images = any(path.suffix.lower() in _SUFFIXES for path in folder.iterdir())
-    return inner if inner.is_dir() and not has_images else folder
 
 
 def _images_in(side: str, folder: Path) -> set[str]:

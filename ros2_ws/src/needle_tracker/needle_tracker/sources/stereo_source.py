@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, cast
@@ -13,7 +13,13 @@ import numpy as np
 
 from needle_core.component import Batch, PortChange
 from needle_core.errors import UserError
-from needle_tracker.sources.image_files import Image, Sizes, open_pairs, size_problem
+from needle_tracker.sources.image_files import (
+    Image,
+    PairSequence,
+    Sizes,
+    open_pairs,
+    size_problem,
+)
 
 LOST_AFTER = 20  # consecutive failed reads of the cameras
 
@@ -41,9 +47,15 @@ class EndOfRecording:
     missing: str = ""
 
 
+Event = StampedPair | EndOfRecording | None
+"""Result of a read of a source: None for a pair that could not be read."""
+Source = Generator[Event, None, None]
+"""Open cameras or recording; a read raises a `UserError` for lost cameras or another size."""
+
+
 def open_source(
     names: tuple[str, str], sizes: Sizes, rate: float, clock: Callable[[], int], *, loop: bool
-) -> CameraPair | RecordedPairs:
+) -> Source:
     """Open cameras or a recording.
 
     Parameters
@@ -75,141 +87,108 @@ def open_source(
             f"left = {left!r} and right = {right!r}: one is a camera, the other a recording"
         )
     if are_cameras == {False}:
-        return RecordedPairs(names, sizes, clock, loop=loop)
+        recording = open_pairs(Path(left), Path(right)).refuse_unpaired()
+        # Reject a recording of another size before its first pair is published.
+        next(recorded_pairs(recording, sizes, clock, loop=False))
+        return recorded_pairs(recording, sizes, clock, loop=loop)
     if left == right:
         raise UserError(f"left and right are the same camera, {left!r}")
-    return CameraPair(names, sizes, rate, clock)
+    return camera_pairs(open_cameras(names, sizes, rate), sizes, clock)
 
 
-class CameraPair:
-    """Two cameras, read by OpenCV.
+def open_cameras(names: tuple[str, str], sizes: Sizes, rate: float) -> list[cv2.VideoCapture]:
+    """Return the left and the right camera, opened by OpenCV; see `open_source`."""
+    captures: list[cv2.VideoCapture] = []
+    for (side, (width, height)), name in zip(sizes.items(), names, strict=True):
+        if name.startswith("/dev/") and not Path(name).exists():
+            raise UserError(f"{side} camera {name} does not exist")
+        capture = _open_device(name)
+        captures.append(capture)
+        if not capture.isOpened():
+            for opened in captures:
+                opened.release()
+            raise UserError(f"{side} camera {name} cannot be opened: missing, or in use")
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
+        capture.set(cv2.CAP_PROP_FPS, rate)
+        # An old frame from a queue would get a new stamp.
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+    return captures
+
+
+def camera_pairs(
+    captures: list[cv2.VideoCapture], sizes: Sizes, clock: Callable[[], int]
+) -> Source:
+    """Yield pairs of two cameras, and close them at the end.
 
     Both images are grabbed before the first is decoded: decoding takes milliseconds, which would
     separate the two exposures. The stamp of an image is the time right after its grab.
 
     Parameters
     ----------
-    names, sizes, rate, clock
+    captures : list of VideoCapture
+        The left and the right camera.
+    sizes, clock
         As for `open_source`.
-    open_capture : callable
-        Opens a device by its name; by default with OpenCV.
     """
-
-    def __init__(
-        self,
-        names: tuple[str, str],
-        sizes: Sizes,
-        rate: float,
-        clock: Callable[[], int],
-        open_capture: Callable[[str], cv2.VideoCapture] | None = None,
-    ) -> None:
-        self._clock, self._sizes = clock, sizes
-        self._failed = 0
-        self._captures: dict[str, cv2.VideoCapture] = {}
-        opened = open_capture or _open_device
-        for side, name in zip(sizes, names, strict=True):
-            if name.startswith("/dev/") and not Path(name).exists():
-                raise UserError(f"{side} camera {name} does not exist")
-            capture = opened(name)
-            if not capture.isOpened():
-                self.close()
-                raise UserError(f"{side} camera {name} cannot be opened: missing, or in use")
-            self._captures[side] = capture
-            for key, value in (
-                (cv2.CAP_PROP_FRAME_WIDTH, sizes[side][0]),
-                (cv2.CAP_PROP_FRAME_HEIGHT, sizes[side][1]),
-                (cv2.CAP_PROP_FPS, rate),
-                # An old frame from a queue would get a new stamp.
-                (cv2.CAP_PROP_BUFFERSIZE, 1),
-            ):
-                capture.set(key, value)
-
-    def next(self) -> StampedPair | None:
-        """Return the next pair; None if a camera failed.
-
-        Raises
-        ------
-        UserError
-            Cameras that were disconnected, or images of another size.
-        """
-        stamps, grabbed = {}, True
-        for side, capture in self._captures.items():
-            grabbed = bool(capture.grab()) and grabbed
-            stamps[side] = self._clock()
-        left, right = (self._retrieve(side) if grabbed else None for side in self._captures)
-        if left is None or right is None:
-            self._failed += 1
-            if self._failed >= LOST_AFTER:
-                raise UserError(f"the cameras gave no pair {LOST_AFTER} times in a row: unplugged?")
-            return None
-        self._failed = 0
-        for (side, expected), image in zip(self._sizes.items(), (left, right), strict=True):
-            if problem := size_problem(side, image.shape[::-1], expected):
-                raise UserError(problem)
-        return StampedPair(left, right, stamps["left"], stamps["right"])
-
-    def close(self) -> None:
-        """Close the cameras."""
-        for capture in self._captures.values():
+    failed = 0
+    try:
+        while failed < LOST_AFTER:
+            grabs = [(capture.grab(), clock()) for capture in captures]
+            is_whole = all(is_grabbed for is_grabbed, _ in grabs)
+            left, right = (_retrieve(capture) if is_whole else None for capture in captures)
+            if left is None or right is None:
+                failed += 1
+                if failed < LOST_AFTER:
+                    yield None
+                continue
+            failed = 0
+            for (side, expected), image in zip(sizes.items(), (left, right), strict=True):
+                if problem := size_problem(side, image.shape[::-1], expected):
+                    raise UserError(problem)
+            yield StampedPair(left, right, grabs[0][1], grabs[1][1])
+        raise UserError(f"the cameras gave no pair {LOST_AFTER} times in a row: unplugged?")
+    finally:
+        for capture in captures:
             capture.release()
 
-    def _retrieve(self, side: str) -> Image | None:
-        good, frame = self._captures[side].retrieve()
-        if not good or frame is None:
-            return None
-        grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-        return np.ascontiguousarray(grey, dtype=np.uint8)
+
+def _retrieve(capture: cv2.VideoCapture) -> Image | None:
+    good, frame = capture.retrieve()
+    if not good or frame is None:
+        return None
+    grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    return np.ascontiguousarray(grey, dtype=np.uint8)
 
 
-class RecordedPairs:
-    """Two folders of images, or two videos, one pair after the other.
+def recorded_pairs(
+    pairs: PairSequence, sizes: Sizes, clock: Callable[[], int], *, loop: bool
+) -> Source:
+    """Yield the pairs of a recording, then its end.
 
     Both images of a pair have one stamp: the time of the request.
 
     Parameters
     ----------
-    names, sizes, clock, loop
+    pairs : PairSequence
+        Two folders or two videos.
+    sizes, clock, loop
         As for `open_source`.
     """
-
-    def __init__(
-        self, names: tuple[str, str], sizes: Sizes, clock: Callable[[], int], *, loop: bool
-    ) -> None:
-        self._clock, self._sizes, self._loop = clock, sizes, loop
-        self._pairs = open_pairs(Path(names[0]), Path(names[1])).refuse_unpaired()
-        # Reject a recording of another size before its first pair is published.
-        next(self._read())
-        self._events = self._read()
-
-    def next(self) -> StampedPair | EndOfRecording | None:
-        """Return the next pair; None if one of its images cannot be read.
-
-        Raises
-        ------
-        UserError
-            Images of another size.
-        """
-        return next(self._events)
-
-    def close(self) -> None:
-        """Close the files."""
-        self._events = iter(())
-
-    def _read(self) -> Iterator[StampedPair | EndOfRecording | None]:
-        repeat = True
-        while repeat:
-            repeat = False
-            for pair in self._pairs:
-                stamp = self._clock()
-                if pair.left is None or pair.right is None:
-                    yield None
-                    continue
-                if problem := pair.problem(self._sizes):
-                    raise UserError(f"{pair.name}: {problem}")
-                repeat = self._loop
-                yield StampedPair(pair.left, pair.right, stamp, stamp)
-        while True:
-            yield EndOfRecording(self._pairs.missing)
+    repeat = True
+    while repeat:
+        repeat = False
+        for pair in pairs:
+            stamp = clock()
+            if pair.left is None or pair.right is None:
+                yield None
+                continue
+            if problem := pair.problem(sizes):
+                raise UserError(f"{pair.name}: {problem}")
+            repeat = loop
+            yield StampedPair(pair.left, pair.right, stamp, stamp)
+    while True:
+        yield EndOfRecording(pairs.missing)
 
 
 def _open_device(name: str) -> cv2.VideoCapture:
@@ -223,20 +202,16 @@ def _open_device(name: str) -> cv2.VideoCapture:
     return cv2.VideoCapture(name, cv2.CAP_V4L2)
 
 
-Event = StampedPair | EndOfRecording | None
-"""Result of a read of a source."""
-
-
 class PairPort:
     """Port of a source: a thread reads the next pair on each request.
 
     Parameters
     ----------
-    source : CameraPair or RecordedPairs
+    source : Source
         An open source, closed with the port.
     """
 
-    def __init__(self, source: CameraPair | RecordedPairs) -> None:
+    def __init__(self, source: Source) -> None:
         self._source = source
         self._reader = ThreadPoolExecutor(1, "pairs")
 
@@ -246,7 +221,7 @@ class PairPort:
 
     def send(self, batch: tuple[Any, ...]) -> None:
         """Request the next pair."""
-        self._reader.submit(self._source.next).add_done_callback(self._on_read)
+        self._reader.submit(next, self._source).add_done_callback(self._on_read)
 
     def close(self) -> None:
         """Close the source, after the current read."""

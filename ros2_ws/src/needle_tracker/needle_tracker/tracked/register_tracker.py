@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import math
 import sys
@@ -16,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from needle_core.commands.cli import EXIT_DONE, run_command, write_json
-from needle_core.commands.options import CommandParser, output_file
+from needle_core.commands.csv_files import read_rows
+from needle_core.commands.options import CommandParser, number, output_file
 from needle_core.errors import UserError
-from needle_core.files.yaml_files import read_text
 from needle_core.settings.bounds import check_bounds
+from needle_tracker.optics.calibration import pose_matrix
 from needle_tracker.tracked.registration import Registration, write_registration
 
 Array = NDArray[np.float64]
@@ -100,10 +100,8 @@ def register(names: list[str], rig: Array, tracker: Array) -> tuple[Registration
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = np.eye(3) * variance / count
     covariance[3:, 3:] = variance * np.linalg.inv(np.sum(arms**2) * np.eye(3) - arms.T @ arms)
-    quaternion = Rotation.from_matrix(found.rotation).as_quat()
-    registration = Registration(
-        found.translation, quaternion, centroid, covariance, np.zeros(3), math.sqrt(variance)
-    )
+    pose = pose_matrix(found.rotation, found.translation)
+    registration = Registration(pose, centroid, covariance, np.zeros(3), math.sqrt(variance))
     return registration, found, left_out
 
 
@@ -194,16 +192,14 @@ def _mm(length: float) -> str:
 
 def _read(path: Path, columns: tuple[str, ...]) -> tuple[list[str], Array]:
     """Return the names and numbers of a CSV, (N, C); a `UserError` gives line and column."""
-    names, rows = [], []
-    for number, row in enumerate(csv.DictReader(read_text(path).splitlines()), 2):
-        names.append(row.get("name") or f"line {number}")
-        for column in columns:
-            try:
-                rows.append(float(row[column]))
-                check_bounds(column, rows[-1], -1e4, 1e4, "-")
-            except (KeyError, TypeError, ValueError, UserError) as error:
-                raise UserError(f"{path}, line {number}: column {column}: {error}") from error
-    return names, np.array(rows).reshape(-1, len(columns))
+    rows = read_rows(path, columns)
+    names = [row.get("name") or f"point {count}" for count, (_, row) in enumerate(rows, 1)]
+    values = [
+        number(f"{where}: {column}", row[column], -1e4, 1e4, "-")
+        for where, row in rows
+        for column in columns
+    ]
+    return names, np.array(values).reshape(-1, len(columns))
 
 
 def main() -> int:

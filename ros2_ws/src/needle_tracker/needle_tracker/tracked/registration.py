@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from needle_core.errors import UserError
 from needle_core.files.file_access import write_text
 from needle_core.files.yaml_files import read_yaml
 from needle_core.settings.bounds import ABOVE_0, check_bounds
-from needle_tracker.optics.calibration import number, numbers, rotation_matrix
+from needle_tracker.optics.calibration import number, numbers, transform_of
 
 Array = NDArray[np.float64]
 
@@ -28,8 +29,8 @@ class Registration:
 
     Attributes
     ----------
-    translation, quaternion : ndarray, shape (3,), (4,)
-        T_rig_tracker: origin [m] and unit quaternion x, y, z, w.
+    T_rig_tracker : ndarray, shape (4, 4)
+        Transforms points of the tracker to `rig` [m].
     centroid : ndarray, shape (3,)
         Centroid of the registration's points in `rig` [m].
     covariance : ndarray, shape (6, 6)
@@ -41,17 +42,11 @@ class Registration:
         Standard deviation of a measured coordinate at rest [m].
     """
 
-    translation: Array
-    quaternion: Array
+    T_rig_tracker: Array
     centroid: Array
     covariance: Array
     tip_offset: Array
     sensor_std: float
-
-    @property
-    def rotation(self) -> Array:
-        """Rotation of T_rig_tracker, shape (3, 3)."""
-        return rotation_matrix(self.quaternion)
 
     def covariance_at(self, position: Array) -> Array:
         """Return the covariance of the registration's error at a place, shape (3, 3) [m^2].
@@ -84,23 +79,21 @@ def read_registration(path: Path) -> Registration:
     content = read_yaml(path)
     try:
         found = Registration(
-            numbers(content, 3, "T_rig_tracker", "translation"),
-            numbers(content, 4, "T_rig_tracker", "rotation"),
+            transform_of(content, "T_rig_tracker"),
             numbers(content, 3, "centroid"),
             numbers(content, 36, "covariance", "data").reshape(6, 6),
             numbers(content, 3, "tip_offset"),
             number(content, "sensor_std"),
         )
-        return _checked(found)
+        _check(found)
     except UserError as error:
         raise UserError(f"registration {path}: {error}") from error
+    return found
 
 
-def _checked(found: Registration) -> Registration:
-    """Return a registration with a normalized quaternion; raise a `UserError` if it is unusable."""
-    norm = float(np.linalg.norm(found.quaternion))
-    check_bounds("norm of T_rig_tracker.rotation", norm, 0.99, 1.01, "-")
-    far, tool = (float(np.linalg.norm(v)) for v in (found.translation, found.tip_offset))
+def _check(found: Registration) -> None:
+    """Raise a `UserError` if a registration is unusable."""
+    far, tool = (float(np.linalg.norm(v)) for v in (found.T_rig_tracker[:3, 3], found.tip_offset))
     check_bounds("length of T_rig_tracker.translation", far, 0.0, _FARTHEST, "m")
     check_bounds("length of tip_offset", tool, 0.0, _LONGEST_TOOL, "m")
     check_bounds("sensor_std", found.sensor_std, ABOVE_0, LARGEST_STD, "m")
@@ -109,16 +102,16 @@ def _checked(found: Registration) -> Registration:
         raise UserError("covariance is not symmetric and positive")
     std = found.std_at(np.zeros(3))
     check_bounds("standard deviation at the entry point", std, 0.0, LARGEST_STD, "m")
-    return dataclasses.replace(found, quaternion=found.quaternion / norm)
 
 
 def write_registration(path: Path, found: Registration, comments: list[str]) -> None:
     """Write a registration file; raises a `UserError` if the file or registration is unusable."""
-    found = _checked(found)
+    _check(found)
+    pose = found.T_rig_tracker
     content = {
         "T_rig_tracker": {
-            "translation": found.translation.tolist(),
-            "rotation": found.quaternion.tolist(),
+            "translation": pose[:3, 3].tolist(),
+            "rotation": Rotation.from_matrix(pose[:3, :3]).as_quat().tolist(),
         },
         "centroid": found.centroid.tolist(),
         "covariance": {"rows": 6, "cols": 6, "data": found.covariance.ravel().tolist()},

@@ -146,10 +146,8 @@ def test_parameters_of_the_node_apply(track: Track, folder: Path, capsys: Out) -
         "stereo_tracker: {ros__parameters: {stage_zero_sigma: 0.002, needle_width: 0.001}}"
     )
     assert track("--params", str(params))[0] == 0
-    assert track("--params", str(params), "--needle-width-mm", "0.5")[0] == 0
-    first, second = Scripted.made
+    (first,) = Scripted.made
     assert (first.stage_zero_sigma, first.needle_width) == (0.002, 0.001)
-    assert second.needle_width == pytest.approx(0.5e-3)
     for side, mm in (("left", 7), ("right", 9)):
         (folder / "empty" / side).mkdir(parents=True)
         save(folder / "empty" / side / "0.png", mm)
@@ -195,7 +193,7 @@ def test_unusable_input_is_reported_in_one_line(track: Track, folder: Path, caps
 
 
 def test_wrong_options_are_reported_in_one_line(track: Track, folder: Path, capsys: Out) -> None:
-    for words in (["--needle-width-mm", "seven"], ["--unknown"], ["--overlay", str(folder)]):
+    for words in (["--unknown"], ["--overlay", str(folder)]):
         code, rows = track(*words)
         assert (code, rows, capsys.readouterr().err.count("\n")) == (2, [], 1)
     for side in ("left", "right"):

@@ -12,7 +12,7 @@ import pytest
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_tracker.calibrating.calibrate_stereo import save_calibration
-from needle_tracker.calibrating.calibration_outliers import contradictions, square_error
+from needle_tracker.calibrating.calibration_outliers import contradictions
 from needle_tracker.calibrating.calibration_session import BoardView, Corners
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_fit import fit
@@ -65,9 +65,9 @@ def test_tips_are_accurate_to_60_micrometres_as_reported(
         assert result.reprojection_rms_px(side, views) == pytest.approx(
             math.sqrt(2) * NOISE_PX, rel=0.15
         )
-    error, sigma = square_error(result)
+    error, sigma = result.square_error
     assert abs(error) < 4.0 * sigma
-    assert contradictions(result, (error, sigma)) == []
+    assert contradictions(result) == []
     assert result.apart == []
 
 
@@ -237,5 +237,5 @@ def test_the_lens_of_a_webcam_is_fitted_with_k3(rig: StereoRig) -> None:
         found = result.parameters[f"{side}.k3"]
         assert not found.kept
         assert abs(found.value - 0.05) < 4.0 * found.sigma < 0.08
-    assert contradictions(result, square_error(result)) == []
+    assert contradictions(result) == []
     assert tip_error(webcams, result.calibration) < 0.07e-3

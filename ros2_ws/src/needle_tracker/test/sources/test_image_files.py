@@ -50,14 +50,11 @@ def test_names_that_differ_in_the_side_are_pairs(tmp_path: Path) -> None:
             assert_paired(a, b, 11, first)
 
 
-def test_equal_names_are_pairs_even_if_they_contain_a_side_in_folders_named_data(
-    tmp_path: Path,
-) -> None:
-    # Folders as in Kalibr and EuRoC.
+def test_equal_names_are_pairs_even_if_they_contain_a_side(tmp_path: Path) -> None:
     names = ["left_wall_1.png", "left_wall_2.png", "right_wall_1.png", "right_wall_2.png"]
     left, right = tmp_path / "cam0", tmp_path / "cam1"
-    save(left / "data", names, 10)
-    save(right / "data", names, 200)
+    save(left, names, 10)
+    save(right, names, 200)
     assert_paired(left, right, 4, names[0])
 
 

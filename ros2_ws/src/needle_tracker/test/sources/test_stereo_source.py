@@ -12,10 +12,10 @@ import pytest
 from needle_core.errors import UserError
 from needle_tracker.sources.stereo_source import (
     LOST_AFTER,
-    CameraPair,
     EndOfRecording,
-    RecordedPairs,
+    Source,
     StampedPair,
+    camera_pairs,
     open_source,
 )
 
@@ -40,12 +40,6 @@ class FakeCapture:
         self.name, self.log, self.width = name, log, width
         self.good = self.opened = True
 
-    def isOpened(self) -> bool:
-        return self.opened
-
-    def set(self, key: int, value: float) -> bool:
-        return True
-
     def grab(self) -> bool:
         self.log.append(f"grab {self.name}")
         return self.good
@@ -58,13 +52,13 @@ class FakeCapture:
         self.opened = False
 
 
-def opened(left: object, right: object, *, loop: bool = False) -> CameraPair | RecordedPairs:
+def opened(left: object, right: object, *, loop: bool = False) -> Source:
     return open_source((str(left), str(right)), SIZES, 100.0, Clock(), loop=loop)
 
 
-def cameras(log: list[str], width: int = 64) -> tuple[CameraPair, dict[str, Any]]:
-    captures: dict[str, Any] = {"0": FakeCapture("0", log, 64), "2": FakeCapture("2", log, width)}
-    return CameraPair(("0", "2"), SIZES, 100.0, Clock(), captures.__getitem__), captures
+def cameras(log: list[str], width: int = 64) -> tuple[Source, list[Any]]:
+    captures: list[Any] = [FakeCapture("0", log, 64), FakeCapture("2", log, width)]
+    return camera_pairs(captures, SIZES, Clock()), captures
 
 
 def write_pairs(folder: Path, count: int, size: tuple[int, int] = (64, 48)) -> tuple[Path, Path]:
@@ -76,10 +70,10 @@ def write_pairs(folder: Path, count: int, size: tuple[int, int] = (64, 48)) -> t
     return folder / "left", folder / "right"
 
 
-def levels_of(source: CameraPair | RecordedPairs, most: int = 99) -> tuple[list[int], str]:
+def levels_of(source: Source, most: int = 99) -> tuple[list[int], str]:
     """Return the grey level of each left image, 0 if unreadable, and the reason of the end."""
     levels: list[int] = []
-    while len(levels) < most and not isinstance(event := source.next(), EndOfRecording):
+    while len(levels) < most and not isinstance(event := next(source), EndOfRecording):
         levels.append(int(event.left[24, 32]) if event else -1)
     return levels, event.missing if isinstance(event, EndOfRecording) else "no end"
 
@@ -87,40 +81,40 @@ def levels_of(source: CameraPair | RecordedPairs, most: int = 99) -> tuple[list[
 def test_both_cameras_are_grabbed_before_either_is_decoded() -> None:
     log: list[str] = []
     source, captures = cameras(log)
-    pair = source.next()
+    pair = next(source)
     assert isinstance(pair, StampedPair)
     assert log == ["grab 0", "grab 2", "retrieve 0", "retrieve 2"]
     assert (pair.left_stamp, pair.right_stamp) == (1_000_000, 2_000_000)
     assert pair.left.shape == (48, 64)
     source.close()
-    assert not any(capture.opened for capture in captures.values())
+    assert not any(capture.opened for capture in captures)
 
 
 def test_a_failing_camera_is_lost_after_some_reads() -> None:
     source, captures = cameras([])
-    captures["2"].good = False
+    captures[1].good = False
     for _ in range(1, LOST_AFTER):
-        assert source.next() is None
-    captures["2"].good = True
-    assert source.next() is not None
-    captures["2"].good = False
+        assert next(source) is None
+    captures[1].good = True
+    assert next(source) is not None
+    captures[1].good = False
     with pytest.raises(UserError, match="20 times in a row"):
         for _ in range(LOST_AFTER):
-            source.next()
+            next(source)
     with pytest.raises(UserError, match="right image is 80x48, the calibration is for 64x48"):
-        cameras([], 80)[0].next()
+        next(cameras([], 80)[0])
 
 
 def test_folders_are_read_in_order_and_end_or_restart(tmp_path: Path) -> None:
     left, right = write_pairs(tmp_path, 3)
-    pair = opened(left, right).next()
+    pair = next(opened(left, right))
     assert isinstance(pair, StampedPair)
     assert (pair.left[0, 0], pair.right[0, 0]) == (0, 5)
     assert pair.left_stamp == pair.right_stamp
     assert levels_of(opened(left, right)) == ([0, 10, 20], "")
     source = opened(left, right, loop=True)
     assert levels_of(source, 4) == ([0, 10, 20, 0], "no end")
-    again = source.next()
+    again = next(source)
     assert isinstance(again, StampedPair)
     # The clock is read for each pair, and for the pair read when the source opens.
     assert again.left_stamp == 6_000_000

@@ -39,7 +39,8 @@ def test_the_claimed_error_is_that_of_many_registrations() -> None:
     for seed in range(30):
         found, _, errors = register(NAMES, RIG, measured(RIG, seed))
         for place in places:
-            error = found.rotation @ TURN.inv().apply(place - PLACE) + found.translation - place
+            pose = found.T_rig_tracker
+            error = pose[:3, :3] @ TURN.inv().apply(place - PLACE) + pose[:3, 3] - place
             covariance = found.covariance_at(place)
             squares.append([error @ error, np.trace(covariance)])
             inside.append(error @ np.linalg.solve(covariance, error) < 14.16)
@@ -132,7 +133,7 @@ def test_file_of_points_and_pivot(tmp_path: Path, monkeypatch: Any) -> None:
     found = read_registration(tmp_path / "out.yaml")
     np.testing.assert_allclose(found.tip_offset, offset, atol=0.4e-3)
     assert found.sensor_std == pytest.approx(FLE, rel=0.2)
-    np.testing.assert_allclose(found.rotation, TURN.as_matrix(), atol=0.01)
+    np.testing.assert_allclose(found.T_rig_tracker[:3, :3], TURN.as_matrix(), atol=0.01)
     assert values["points"] == 6
     assert 0.1 < values["fiducial_error_mm"] < values["target_error_mm"] < 2.0
     assert values["std_at_entry_mm"] == pytest.approx(1e3 * found.std_at(np.zeros(3)))

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from needle_core import messages as m
 from needle_core.component import Diagnose, Moment, Peers, PortChange, Publish
 from needle_core.openigtlink import LinkMessage, LinkStream, checksum
+from needle_tracker.optics.calibration import pose_matrix
 from needle_tracker.tracked.registration import Registration
 from needle_tracker.tracked_tip import TrackedTip, TrackedTipParameters
 from plus_messages import message, transform_message
@@ -18,8 +19,7 @@ from plus_messages import message, transform_message
 TURN = Rotation.from_euler("xyz", (2.0, -0.4, 1.1))
 PLACE = np.array([0.21, -0.33, 0.28])
 REGISTRATION = Registration(
-    translation=PLACE,
-    quaternion=TURN.as_quat(),
+    T_rig_tracker=pose_matrix(TURN.as_matrix(), PLACE),
     centroid=np.zeros(3),
     covariance=np.diag([1e-8] * 3 + [1e-4] * 3),
     tip_offset=np.array([0.0, 0.0, 0.01]),
