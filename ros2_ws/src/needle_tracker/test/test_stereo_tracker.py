@@ -17,8 +17,10 @@ from needle_core.component import Actions, Diagnose, Log, Moment, Peers, Publish
 from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 from needle_tracker.answers.tracker_messages import camera_info_problem, image_geometry
+from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.optics.calibration import Camera, StereoCalibration
+from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.stereo.triangulation import SpatialTip
 from needle_tracker.stereo_tracker import StereoTipTracker, make_tracker
 from needle_tracker.tracker_parameters import StereoTrackerParameters
@@ -92,8 +94,16 @@ class Bench:
 Make = Callable[..., Bench]
 
 
+@pytest.fixture(scope="module")
+def search_grid(views: tuple[RefractedCamera, RefractedCamera]) -> SearchGrid:
+    """Return the grid that all trackers of these tests share; to make it takes some time."""
+    return make_search_grid(views, StereoTrackerParameters())
+
+
 @pytest.fixture
-def make(calibration: StereoCalibration, monkeypatch: pytest.MonkeyPatch) -> Make:
+def make(
+    calibration: StereoCalibration, search_grid: SearchGrid, monkeypatch: pytest.MonkeyPatch
+) -> Make:
     monkeypatch.setattr(
         "needle_tracker.filter.needle_tracker.NeedleTracker.warm_up", lambda _: None
     )

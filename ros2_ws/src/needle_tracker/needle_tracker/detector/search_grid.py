@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
+from needle_core.compiled import compiled
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
@@ -126,14 +126,19 @@ def make_search_grid(
     offsets = np.arange(-half, half + 1)
     tilts = GRID.angle_pitch * np.hypot(offsets[:, None], offsets)
     cells = np.argwhere(tilts <= np.minimum(limit, widest)[:, None, None])
-    pixels, depths = _interpolated(cameras, distances, side, cells)
-    last = np.array([[each.camera.width, each.camera.height] for each in cameras])[:, None] - 1
-    seen = (pixels >= GRID.border_px) & (pixels <= last - GRID.border_px)
-    inside = seen.all(axis=(0, 2)) & (depths >= 0.0).all(axis=0)
-    rows, columns, pixels = cells[inside, 0], cells[inside, 1:], pixels[:, inside]
-    starts = np.searchsorted(rows, np.arange(len(distances) + 1))
-    left, right = (GridView(seen.astype(np.float32), _boxes(seen, starts)) for seen in pixels)
-    return SearchGrid(distances, starts, np.ascontiguousarray(columns), side, (left, right))
+    seen = np.empty((len(cells), 6))
+    _interpolate(_lattice(cameras, distances, side), cells, GRID.lattice, seen)
+    border, inside = GRID.border_px, (seen[:, 4:] >= 0.0).all(axis=1)
+    for i, each in enumerate(cameras):
+        for j, size in enumerate((each.camera.width, each.camera.height)):
+            pixels = seen[:, 2 * i + j]
+            inside &= (pixels >= border) & (pixels <= size - 1 - border)
+    cells = cells[inside]
+    starts = np.searchsorted(cells[:, 0], np.arange(len(distances) + 1))
+    columns = np.ascontiguousarray(cells[:, 1:])
+    left, right = (seen[inside, 2 * i : 2 * i + 2].astype(np.float32) for i in range(2))
+    views = GridView(left, _boxes(left, starts)), GridView(right, _boxes(right, starts))
+    return SearchGrid(distances, starts, columns, side, views)
 
 
 def _directions(columns: Indices, side: int) -> Array:
@@ -143,32 +148,48 @@ def _directions(columns: Indices, side: int) -> Array:
     return np.concatenate([np.sinc(tilt / math.pi) * tilts, np.cos(tilt)], axis=-1)
 
 
-def _interpolated(
-    cameras: tuple[RefractedCamera, RefractedCamera],
-    distances: Array,
-    side: int,
-    cells: Indices,
-) -> tuple[Array, Array]:
-    """Return pixels and depths behind the window, shape (2, n, 2) and (2, n), of n cells."""
+def _lattice(
+    cameras: tuple[RefractedCamera, RefractedCamera], distances: Array, side: int
+) -> Array:
+    """Return the pixels in both images and the depths behind both windows of some cells.
+
+    Returns
+    -------
+    ndarray, shape (rows, columns, columns, 6)
+        For every `GridSettings.lattice`-th cell in each direction.
+    """
     step = GRID.lattice
     rows = -(-(len(distances) - 1) // step) + 1
     apart = distances[0] + step * GRID.row_pitch * np.arange(rows)
     columns = np.stack(np.meshgrid(*[np.arange(0, side, step)] * 2, indexing="ij"), axis=-1)
     points = apart[:, None, None, None] * _directions(columns, side)
-
-    def at_cells(values: Array) -> Array:
-        return np.asarray(map_coordinates(values, cells.T / step, order=1))
-
-    pixels, depths = [], []
-    for each in cameras:
-        # A point behind the camera is put outside the image.
-        projected = np.nan_to_num(each.project(points), nan=-1.0)
-        pixels.append(np.stack([at_cells(projected[..., i]) for i in range(2)], axis=-1))
-        depths.append(at_cells(each.camera.window.depth(points)))
-    return np.stack(pixels), np.stack(depths)
+    # A point behind the camera is put outside the image.
+    pixels = [np.nan_to_num(each.project(points), nan=-1.0) for each in cameras]
+    depths = [each.camera.window.depth(points)[..., None] for each in cameras]
+    return np.concatenate([*pixels, *depths], axis=-1)
 
 
-def _boxes(pixels: Array, starts: Indices) -> Array:
+@compiled
+def _interpolate(lattice: Array, cells: Indices, step: int, values: Array) -> None:
+    """Write the values of cells, shape (n, 6), interpolated between the points of a lattice."""
+    last = np.array(lattice.shape[:3]) - 2
+    corner, share = np.empty(3, np.int64), np.empty(3)
+    for c in range(len(cells)):
+        for axis in range(3):
+            corner[axis] = min(cells[c, axis] // step, last[axis])
+            share[axis] = cells[c, axis] / step - corner[axis]
+        values[c] = 0.0
+        for k in range(8):
+            weight = 1.0
+            i, j, m = k // 4, k // 2 % 2, k % 2
+            weight *= share[0] if i else 1.0 - share[0]
+            weight *= share[1] if j else 1.0 - share[1]
+            weight *= share[2] if m else 1.0 - share[2]
+            for v in range(values.shape[1]):
+                values[c, v] += weight * lattice[corner[0] + i, corner[1] + j, corner[2] + m, v]
+
+
+def _boxes(pixels: NDArray[np.float32], starts: Indices) -> Array:
     """Return the boxes of the rows; an empty row has an empty box."""
     boxes = np.full((len(starts) - 1, 4), [np.inf, np.inf, -np.inf, -np.inf])
     filled = starts[:-1] < starts[1:]

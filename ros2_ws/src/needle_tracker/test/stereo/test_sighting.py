@@ -6,13 +6,13 @@ import dataclasses
 import math
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 import drawn_needles
 from needle_tracker.detector.end_fit import ImageEnd
-from needle_tracker.detector.search_grid import GridView, SearchGrid
+from needle_tracker.detector.search_grid import GridView, SearchGrid, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.stereo.sighting import StereoSearch, evidence, shaft_length
 from needle_tracker.stereo.triangulation import triangulate
@@ -35,11 +35,13 @@ class SeenLines:
     ) -> tuple[np.ndarray, np.ndarray]:
         pixels = seen.pixels[: grid.starts[last_row + 1]]
         shaft, ends = np.full(len(pixels), -1.0), np.full(len(pixels), -3.0)
+        canvas = np.zeros((self.view.camera.height, self.view.camera.width), np.uint8)
         for line in self.lines:
             drawn = self.view.project(line)
-            away, _ = cKDTree(drawn).query(pixels, distance_upper_bound=5.0)
-            shaft[np.isfinite(away)] = 1.0
+            cv2.polylines(canvas, [np.rint(drawn).astype(np.int32)], False, 1, 10)
             ends[np.linalg.norm(pixels - drawn[-1], axis=1) < 5.0] = 6.0
+        columns, rows = np.rint(pixels).astype(int).T
+        shaft[canvas[rows, columns] > 0] = 1.0
         return shaft.astype(np.float32), ends.astype(np.float32)
 
     def ends_near(
@@ -54,8 +56,11 @@ class SeenLines:
         return found
 
 
-@pytest.fixture
-def search(views: Views, settings: StereoTrackerParameters) -> Search:
+@pytest.fixture(scope="module")
+def search(views: Views) -> Search:
+    settings = StereoTrackerParameters(max_insertion=0.1)
+    make_search_grid(views, settings)
+
     def make(left: list[np.ndarray], right: list[np.ndarray]) -> StereoSearch:
         detectors = SeenLines(views[0], left), SeenLines(views[1], right)
         return StereoSearch(views, detectors, settings)  # type: ignore[arg-type]
