@@ -25,7 +25,7 @@ Indices = NDArray[np.int64]
 
 @dataclasses.dataclass(frozen=True)
 class GridSettings:
-    """Constants of the search grid; half or twice the pitches find as many needles.
+    """Constants of the search grid; half the row pitch, or 0.7 deg, finds as many needles.
 
     Attributes
     ----------
