@@ -180,9 +180,8 @@ def _interpolate(lattice: Array, cells: Indices, step: int, values: Array) -> No
             share[axis] = cells[c, axis] / step - corner[axis]
         values[c] = 0.0
         for k in range(8):
-            weight = 1.0
             i, j, m = k // 4, k // 2 % 2, k % 2
-            weight *= share[0] if i else 1.0 - share[0]
+            weight = share[0] if i else 1.0 - share[0]
             weight *= share[1] if j else 1.0 - share[1]
             weight *= share[2] if m else 1.0 - share[2]
             for v in range(values.shape[1]):

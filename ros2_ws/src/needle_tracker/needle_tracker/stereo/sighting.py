@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator
 
@@ -120,11 +121,12 @@ class StereoSearch:
         sightings: list[Sighting] = []
         for shaft in shafts:
             points = grid.points(shaft.cells)
+            left = self._ends(0, grid, shaft, hidden=hidden)
             # Most shafts that are not the needle's have no end in the left image at full size.
-            for left in self._ends(0, grid, shaft, hidden=hidden):
-                for right in self._ends(1, grid, shaft, hidden=hidden):
-                    if all(_differ((left, right), other.ends) for other in sightings):
-                        sightings.extend(self._sightings((left, right), points, least, most))
+            right = self._ends(1, grid, shaft, hidden=hidden) if left else []
+            for ends in itertools.product(left, right):
+                if all(_differ(ends, other.ends) for other in sightings):
+                    sightings.extend(self._sightings(ends, points, least, most))
         if sightings:
             sightings.sort(key=lambda sighting: -sighting.evidence)
             return sightings, sightings[0].ends
