@@ -11,7 +11,7 @@ from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.calibrating.rig_calibration import calibrate
-from needle_tracker.calibrating.rig_model import measured_points, needle_points
+from needle_tracker.calibrating.rig_model import needle_points, tip_errors
 from needle_tracker.optics.calibration import load_calibration
 from synthetic_rig import GIVEN, SIZES, take
 
@@ -43,4 +43,4 @@ def calibrated_tip_errors(calibration: Path, seed: int, corner_sigma: float) -> 
     found = calibrate(views, SIZES, GIVEN).calibration
     points = needle_points(load_calibration(calibration))
     left, right = (project(points, camera) for camera in (rig.left, rig.right))
-    return np.asarray(np.linalg.norm(measured_points(found, left, right) - points, axis=1))
+    return np.asarray(np.linalg.norm(tip_errors(found, points, left, right), axis=1))

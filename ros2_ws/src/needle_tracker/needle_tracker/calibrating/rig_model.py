@@ -35,8 +35,8 @@ from needle_tracker.optics.calibration import (
     pose_matrix,
     surface_from_above,
 )
-from needle_tracker.optics.refraction import RefractedCamera, project_optical, stereo_views
-from needle_tracker.stereo.triangulation import midpoint
+from needle_tracker.optics.refraction import RefractedCamera, stereo_views
+from needle_tracker.stereo.triangulation import locate
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -56,6 +56,7 @@ _STEPS = {"f": 0.1, "c": 0.1, "k": 1e-4, "p": 1e-4, "r": 1e-5, "t": 1e-5, "s": 1
 HALF_HEIGHT, HALF_WIDTH = 0.0155, 0.015
 INSERTIONS = (0.005, 0.120)
 LEAST_DEPTH = 1e-3
+_BEYOND = 10.0  # farther than any board in air [m]
 _DRAWS = 400
 _SEED = 0
 
@@ -158,14 +159,13 @@ class RigModel:
 
     def project(self, parameters: Array, side: str) -> Array:
         """Return the expected pixels of the corners of one camera, shape (n, 2) [px]."""
-        camera, under = self._camera(parameters, side), self._under[side]
-        boards, transform = self.board_poses(parameters)[self.view_of[side]], camera.T_optical_rig
+        boards = self.board_poses(parameters)[self.view_of[side]]
         corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side])
         corners = (1.0 + parameters[SQUARES]) * corners + boards[:, :3, 3]
-        optical = corners @ transform[:3, :3].T + transform[:3, 3]
-        if np.any(under):
-            optical[under] = RefractedCamera(camera).apparent_points(corners[under])
-        return project_optical(camera, optical)
+        camera, under = self._camera(parameters, side), self._under[side]
+        pixels = RefractedCamera(_in_air(camera)).project(corners)
+        pixels[under] = RefractedCamera(camera).project(corners[under])
+        return pixels
 
     def jacobian(self, parameters: Array, free: Mask) -> Array:
         """Return d(residuals)/d(free parameters), shape (2 * corners, free).
@@ -233,6 +233,13 @@ class RigModel:
         )
 
 
+def _in_air(camera: Camera) -> Camera:
+    """Return a camera with its window beyond everything that it sees."""
+    window = camera.window
+    beyond = window.point - _BEYOND * window.normal
+    return dataclasses.replace(camera, window=dataclasses.replace(window, point=beyond))
+
+
 def _place_sigma(view: BoardView) -> Array:
     """Return the standard deviations of the place of a board, shape (6,) [rad, m]."""
     if view.place is None or not view.place.is_known:
@@ -280,21 +287,28 @@ def tip_shifts(assumed: StereoCalibration, true: StereoCalibration) -> Array:
     """
     points = needle_points(true)
     left, right = (view.project(points) for view in stereo_views(true))
-    return measured_points(assumed, left, right) - points
+    return tip_errors(assumed, points, left, right)
 
 
-def measured_points(assumed: StereoCalibration, left: Array, right: Array) -> Array:
-    """Triangulate pairs of pixels with a calibration; shape (n, 3), in `rig` [m].
+def tip_errors(assumed: StereoCalibration, points: Array, left: Array, right: Array) -> Array:
+    """Return the errors of points that are triangulated from exact pixels, shape (n, 3) [m].
 
     Parameters
     ----------
     assumed : StereoCalibration
         Calibration of the triangulation.
+    points : ndarray, shape (n, 3)
+        True points in `rig` [m].
     left, right : ndarray, shape (n, 2)
-        Pixels of the two cameras.
+        Their pixels in both images; NaN is returned where two do not determine a point.
     """
     views = stereo_views(assumed)
-    return np.stack([midpoint(views, pair) for pair in zip(left, right, strict=True)])
+    errors = np.full(points.shape, np.nan)
+    for i, point in enumerate(points):
+        found = locate(views, np.stack([left[i], right[i]]), point)
+        if found is not None:
+            errors[i] = found[0] - point
+    return errors
 
 
 def tip_error_p95(

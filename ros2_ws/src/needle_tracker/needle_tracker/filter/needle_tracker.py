@@ -292,7 +292,7 @@ class NeedleTracker:
                 return None
             ends.append(end)
         pair: tuple[ImageEnd, ImageEnd] = (ends[0], ends[1])
-        tip = triangulate(self.views, pair)
+        tip = triangulate(self.views, pair, position)
         if tip is None or not track.fits(tip, self.settings):
             return None
         sighting = Sighting(tip, pair, evidence(pair, tip))

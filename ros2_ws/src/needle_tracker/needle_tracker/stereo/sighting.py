@@ -152,7 +152,7 @@ class StereoSearch:
         self, ends: tuple[ImageEnd, ImageEnd], points: Array, least: float, most: float
     ) -> Iterator[Sighting]:
         """Yield the sighting of two ends, if they can be those of the needle."""
-        tip = triangulate(self.views, ends)
+        tip = triangulate(self.views, ends, points[-1])
         if tip is None or tip.misfit > PAIRING.gate or not self.is_possible(tip, least, most):
             return
         before = np.linalg.norm(points, axis=1) < np.linalg.norm(tip.position)

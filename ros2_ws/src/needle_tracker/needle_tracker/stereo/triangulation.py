@@ -8,27 +8,20 @@ affects the depth.
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_core.compiled import compiled
 from needle_tracker.detector.end_fit import ImageEnd
-from needle_tracker.optics.refraction import (
-    RefractedCamera,
-    cross,
-    dot,
-    pixel_ray,
-    point_jacobian,
-    project_point,
-)
+from needle_tracker.optics.refraction import RefractedCamera
 
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
 _ROUNDING = 1e-10  # step of a converged position [m]; scaled determinant of a singular matrix
 _LEAST_SINE = 1e-3  # least sine of the angle between the planes through a camera and the shaft
+_LARGEST_VARIANCE = 1.0  # of a direction that is determined [-]
+_IMAGE_AXES, _EQUAL = np.stack([np.eye(2)] * 2), np.ones((2, 2))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,41 +49,10 @@ class SpatialTip:
     misfit: float = 0.0
 
 
-def midpoint(views: tuple[RefractedCamera, RefractedCamera], tips: tuple[Array, Array]) -> Array:
-    """Return the point halfway between two refracted rays at their closest, in `rig` [m].
-
-    Parameters
-    ----------
-    views : pair of RefractedCamera
-        Left and right.
-    tips : pair of ndarray, shape (2,)
-        Pixels, left and right.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        Midpoint; NaN for parallel rays.
-    """
-    p, a, q, b = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    pixel_ray(views[0].packed, np.asarray(tips[0], dtype=np.float64), p, a)
-    pixel_ray(views[1].packed, np.asarray(tips[1], dtype=np.float64), q, b)
-    cosine = float(a @ b)
-    denominator = 1.0 - cosine * cosine
-    if not denominator > 0.0:
-        return np.full(3, np.nan)
-    between = q - p
-    along_a = float(between @ a - cosine * (between @ b)) / denominator
-    along_b = float(cosine * (between @ a) - between @ b) / denominator
-    return np.asarray(0.5 * (p + along_a * a + q + along_b * b))
-
-
 def triangulate(
-    views: tuple[RefractedCamera, RefractedCamera], ends: tuple[ImageEnd, ImageEnd]
+    views: tuple[RefractedCamera, RefractedCamera], ends: tuple[ImageEnd, ImageEnd], start: Array
 ) -> SpatialTip | None:
     """Return the least-squares tip of both images.
-
-    Gauss-Newton on the four image residuals (across and along the shaft, per camera), each over its
-    standard deviation; the covariance is the inverse of the normal matrix.
 
     Parameters
     ----------
@@ -98,119 +60,104 @@ def triangulate(
         Left and right.
     ends : pair of ImageEnd
         End of the needle in the left and the right image.
+    start : ndarray, shape (3,)
+        Approximate position in `rig` [m].
 
     Returns
     -------
     SpatialTip or None
-        None if the two views do not determine a point.
+        None if the two views do not determine position and direction.
     """
-    position = midpoint(views, (ends[0].point, ends[1].point))
-    if not np.all(np.isfinite(position)):
+    points = np.stack([end.point for end in ends])
+    axes = np.array([[[-end.direction[1], end.direction[0]], end.direction] for end in ends])
+    sigmas = np.array([[end.sigma_across, end.sigma_along] for end in ends])
+    found = locate(views, points, start, axes, sigmas)
+    if found is None:
         return None
-    axes = np.array(
-        [[[-end.direction[1], end.direction[0]], end.direction] for end in ends]
-    )  # rows: across, along
-    sigmas = np.array([s for end in ends for s in (end.sigma_across, end.sigma_along)])
-    converged, normal, residual, jacobians = _solve_position(
-        (views[0].packed, views[1].packed),
-        np.stack([end.point for end in ends]),
-        axes,
-        sigmas,
-        position,
-    )
-    if not converged:
-        return None
-    direction, direction_covariance = np.empty(3), np.zeros((3, 3))
+    position, covariance, residuals = found
+    jacobians = np.stack([view.jacobian(position) for view in views])
     sigma_angles = np.array([end.sigma_angle for end in ends])
-    if not _shaft_direction(jacobians, axes, sigma_angles, direction, direction_covariance):
+    shaft = _shaft_direction(*np.swapaxes(axes @ jacobians, 0, 1), sigma_angles)
+    if shaft is None:
         return None
-    if direction_covariance.trace() > 1.0:
-        return None
-    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-    misfit = float(np.sum(residual**2))
-    return SpatialTip(position, covariance, direction, direction_covariance, misfit)
+    return SpatialTip(position, covariance, *shaft, float(np.sum(residuals**2)))
 
 
-@compiled
-def _solve_position(
-    cameras: tuple[Array, Array], points: Array, axes: Array, sigmas: Array, position: Array
-) -> tuple[bool, Array, Array, Array]:
-    """Fit a position to two image points, each known across and along its shaft.
+def locate(
+    views: tuple[RefractedCamera, RefractedCamera],
+    points: Array,
+    start: Array,
+    axes: Array = _IMAGE_AXES,
+    sigmas: Array = _EQUAL,
+) -> tuple[Array, Array, Array] | None:
+    """Fit a position to its two image points, by Gauss-Newton.
 
     Parameters
     ----------
-    cameras : pair of ndarray
-        Packed cameras, from `pack_camera`.
+    views : pair of RefractedCamera
+        Left and right.
     points : ndarray, shape (2, 2)
-        Image points [px].
+        Left and right image point [px].
+    start : ndarray, shape (3,)
+        Approximate position in `rig` [m].
     axes : ndarray, shape (2, 2, 2)
-        Per camera the unit vectors across and along the shaft.
-    sigmas : ndarray, shape (4,)
-        Standard deviations: left across, left along, right across, right along [px].
-    position : ndarray, shape (3,)
-        Initial value, replaced by the result [m].
+        Per view two perpendicular unit vectors; by default along u and v.
+    sigmas : ndarray, shape (2, 2)
+        Standard deviations of the points along the axes [px].
 
     Returns
     -------
-    converged : bool
-        Whether the iteration converged.
-    normal : ndarray, shape (3, 3)
-        Normal matrix: the inverse of the covariance.
-    residual : ndarray, shape (4,)
-        Residuals over `sigmas`.
-    jacobians : ndarray, shape (2, 2, 3)
-        Jacobians of both cameras at the position [px/m].
+    position : ndarray, shape (3,)
+        Position in `rig` [m].
+    covariance : ndarray, shape (3, 3)
+        Its covariance [m^2]: the inverse of the normal matrix.
+    residuals : ndarray, shape (4,)
+        Residuals along the axes over `sigmas`.
+    None is returned in place of all three if the views do not determine a position.
     """
-    jacobians, rows, residual = np.empty((2, 2, 3)), np.empty((4, 3)), np.empty(4)
-    normal, pixel = np.zeros((3, 3)), np.empty(2)
+    position = start
     for _ in range(_ITERATIONS):
-        for i in range(2):
-            project_point(cameras[i], position, pixel)
-            point_jacobian(cameras[i], position, jacobians[i])
-            off = points[i] - pixel
-            for k in range(2):
-                across, along = axes[i, k] / sigmas[2 * i + k]
-                residual[2 * i + k] = across * off[0] + along * off[1]
-                rows[2 * i + k] = across * jacobians[i, 0] + along * jacobians[i, 1]
+        slopes = np.stack([view.jacobian(position) for view in views])
+        off = points - np.stack([view.project(position) for view in views])
+        rows = (axes @ slopes / sigmas[..., None]).reshape(4, 3)
+        residuals = (np.einsum("vij,vj->vi", axes, off) / sigmas).ravel()
         normal = rows.T @ rows
         # Scaled by its diagonal, the determinant shows how well the position is determined.
-        product = normal[0, 0] * normal[1, 1] * normal[2, 2]
-        # A NaN from a point behind a camera must not reach det().
-        if not (0.0 < product < math.inf and np.linalg.det(normal) > _ROUNDING * product):
-            break
-        step = np.linalg.solve(normal, rows.T @ residual)
-        position += step
+        if not np.linalg.det(normal) > _ROUNDING * np.prod(np.diag(normal)):
+            return None
+        step = np.linalg.solve(normal, rows.T @ residuals)
+        position = position + step
         if np.abs(step).max() < _ROUNDING:
-            return True, normal, residual, jacobians
-    return False, normal, residual, jacobians
+            return position, np.linalg.inv(normal), residuals
+    return None
 
 
-@compiled
 def _shaft_direction(
-    jacobians: Array, axes: Array, sigma_angles: Array, direction: Array, covariance: Array
-) -> bool:
-    """Write the direction of the shaft in `rig`, and add its covariance; False if undetermined.
+    normals: Array, alongs: Array, sigma_angles: Array
+) -> tuple[Array, Array] | None:
+    """Return the direction of the shaft in `rig` and its covariance; None if undetermined.
 
     Seen through the Jacobian J of a camera, the direction d runs along the image line: n . J d = 0
     with n perpendicular to the line. So d is perpendicular to both J^T n: the intersection of two
     planes.
+
+    Parameters
+    ----------
+    normals, alongs : ndarray, shape (2, 3)
+        J^T n and J^T t of both views, with t along the image line.
+    sigma_angles : ndarray, shape (2,)
+        Standard deviations of the directions of the image lines [rad].
     """
-    normals, alongs, turned = np.empty((2, 3)), np.empty((2, 3)), np.empty(3)
-    for i in range(2):
-        normals[i] = axes[i, 0, 0] * jacobians[i, 0] + axes[i, 0, 1] * jacobians[i, 1]
-        alongs[i] = axes[i, 1, 0] * jacobians[i, 0] + axes[i, 1, 1] * jacobians[i, 1]
-    cross(normals[0], normals[1], direction)
-    length = math.sqrt(dot(direction, direction))
-    product = math.sqrt(dot(normals[0], normals[0]) * dot(normals[1], normals[1]))
-    if not length > _LEAST_SINE * product:
-        return False
+    direction = np.cross(*normals)
+    length = float(np.linalg.norm(direction))
+    if not length > _LEAST_SINE * float(np.prod(np.linalg.norm(normals, axis=1))):
+        return None
     # The direction must be towards the tip in both images.
-    direction /= -length if dot(alongs[0], direction) < 0.0 else length
-    if dot(alongs[1], direction) <= 0.0:
-        return False
-    # A rotation of an image line by da changes its n by -da t (t along): dn = -da J^T t.
-    for i in range(2):
-        cross(alongs[i], normals[1 - i], turned)
-        turned -= dot(direction, turned) * direction
-        covariance += (sigma_angles[i] / length) ** 2 * np.outer(turned, turned)
-    return True
+    direction = direction / np.copysign(length, alongs[0] @ direction)
+    if alongs[1] @ direction <= 0.0:
+        return None
+    # A rotation of an image line by da changes its n by -da t: dn = -da J^T t.
+    turned = np.cross(alongs, normals[::-1]) * (sigma_angles / length)[:, None]
+    turned -= np.outer(turned @ direction, direction)
+    covariance = turned.T @ turned
+    return (direction, covariance) if covariance.trace() <= _LARGEST_VARIANCE else None

@@ -20,8 +20,8 @@ from needle_tracker.calibrating.rig_model import (
     LENS,
     RigModel,
     camera_slice,
-    measured_points,
     needle_points,
+    tip_errors,
 )
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from synthetic_rig import (
@@ -46,7 +46,7 @@ def tip_error(rig: StereoRig, calibration: StereoCalibration) -> float:
     """Return the 95th percentile of the errors of noise-free tips all over the phantom [m]."""
     points = needle_points(calibration)
     left, right = (pixels_of(camera, points, True) for camera in (rig.left, rig.right))
-    errors = np.linalg.norm(measured_points(calibration, left, right) - points, axis=-1)
+    errors = np.linalg.norm(tip_errors(calibration, points, left, right), axis=-1)
     return float(np.percentile(errors, 95.0))
 
 

@@ -117,7 +117,7 @@ def test_evidence_is_the_sum_over_the_views(views: Views, needle: np.ndarray) ->
         for view in views
     )
     left, right = ends
-    tip = triangulate(views, (left, right))
+    tip = triangulate(views, (left, right), needle[-1])
     assert tip is not None
     sure = evidence((left, right), tip)
     doubtful = evidence((left, dataclasses.replace(right, ends=0.05)), tip)
