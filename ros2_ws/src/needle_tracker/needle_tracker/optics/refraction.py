@@ -5,9 +5,6 @@ acrylic, then the body with the needle. A ray from the camera and its refracted 
 one plane with the normal of the window, so that refraction is a problem in that plane.
 """
 
-# Compiled functions take plain numbers, one by one.
-# ruff: noqa: PLR0917
-
 from __future__ import annotations
 
 import math

@@ -75,9 +75,9 @@ def triangulate(
     if found is None:
         return None
     position, covariance, residuals = found
-    jacobians = np.stack([view.jacobian(position) for view in views])
+    slopes = axes @ np.stack([view.jacobian(position) for view in views])
     sigma_angles = np.array([end.sigma_angle for end in ends])
-    shaft = _shaft_direction(*np.swapaxes(axes @ jacobians, 0, 1), sigma_angles)
+    shaft = _shaft_direction(slopes[:, 0], slopes[:, 1], sigma_angles)
     if shaft is None:
         return None
     return SpatialTip(position, covariance, *shaft, float(np.sum(residuals**2)))

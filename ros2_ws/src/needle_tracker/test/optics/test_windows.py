@@ -5,7 +5,6 @@ Oracles: the package aquacal, Fermat's principle, Snell's law, OpenCV's projecti
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import importlib.util
 import sys
