@@ -1,8 +1,5 @@
 """Fit of the line and the end of the shaft to the maps of the network, near an expected end."""
 
-# Compiled functions take plain numbers, one by one; numba's floor and ceil are floats.
-# ruff: noqa: PLR0917, RUF046
-
 from __future__ import annotations
 
 import dataclasses
@@ -11,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from needle_core.compiled import compiled, inlined
+from scipy.ndimage import map_coordinates
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -52,7 +48,7 @@ class EndFitSettings(NamedTuple):
 
 
 FIT = EndFitSettings()
-_PASSES = 2  # passes of the line fit; the second one is centred on the result of the first
+_ROUNDING = 1e-9  # includes the end of a range of positions [px]; least sum of probabilities
 _ONE_SIGMA = 0.5 * (1.0 + math.erf(math.sqrt(0.5)))  # share of a normal distribution below 1 sigma
 
 
@@ -119,148 +115,135 @@ def fit_end(
     back = min(shaft_length, FIT.line_widths * width)
     if back < FIT.least_line_widths * width:
         return None
-    point = np.ascontiguousarray(point, np.float64)
-    direction = np.ascontiguousarray(direction, np.float64)
-    offset, slope = _best_line(shaft, point, direction, back, across, width)
-    end, spread = 0.0, along
-    sigma_across = sigma_angle = certainty = 0.0
-    for _ in range(_PASSES):
-        length, offset, slope, sigma_across, sigma_angle, certainty = _fit_line(
-            shaft, point, direction, offset, slope, end, back, width
-        )
-        if length < FIT.least_line_widths * width:
-            return None
-        end, spread = _end_on_line(ends, point, direction, offset, slope, along, width)
-    norm, across_direction = math.hypot(1.0, slope), np.array([-direction[1], direction[0]])
-    fitted = point + end * direction + (offset + slope * end) * across_direction
+    axes = Axes(point, direction)
+    line = _best_line(shaft, axes, back, across, width)
+    rough = _fit_line(shaft, axes, line, end=0.0, back=back, width=width)
+    if rough is None:
+        return None
+    # The second fit is centred on the end that the first one leads to.
+    end, _ = _end_on_line(ends, axes, rough.line, along, width)
+    fitted = _fit_line(shaft, axes, rough.line, end=end, back=back, width=width)
+    if fitted is None:
+        return None
+    line = fitted.line
+    end, spread = _end_on_line(ends, axes, line, along, width)
+    norm, offset = math.hypot(1.0, line.slope), float(line.at(np.float64(end)))
+    middle = axes.point + end * axes.direction + offset * axes.across
     return ImageEnd(
-        fitted,
-        (direction + slope * across_direction) / norm,
-        math.hypot(sigma_across, FIT.systematic_widths * width),
+        middle,
+        (axes.direction + line.slope * axes.across) / norm,
+        math.hypot(fitted.sigma, FIT.systematic_widths * width),
         math.hypot(spread * norm, FIT.systematic_widths * width),
-        math.hypot(sigma_angle, FIT.systematic_widths / FIT.line_widths),
-        _ends_about(ends, fitted, width),
-        certainty,
+        math.hypot(fitted.sigma_angle, FIT.systematic_widths / FIT.line_widths),
+        _ends_about(ends, middle, width),
+        fitted.certainty,
     )
 
 
 def _ends_about(ends: Map, point: Array, width: float) -> float:
     """Return the expected number of ends within one needle width of a point."""
-    half = max(int(math.ceil(width)), 2)
+    half = max(math.ceil(width), 2)
     column, row = np.rint(point).astype(int)
     rows = slice(max(row - half, 0), max(row + half + 1, 0))
     columns = slice(max(column - half, 0), max(column + half + 1, 0))
     return float(ends[rows, columns].sum())
 
 
-@inlined
-def _at(image: Map, x: float, y: float) -> float:
-    """Return the value of a map by bilinear interpolation; 0 outside."""
-    column, row = int(math.floor(x)), int(math.floor(y))
-    if column < 0 or row < 0 or column + 1 >= image.shape[1] or row + 1 >= image.shape[0]:
-        return 0.0
-    a, b = x - column, y - row
-    above = (1.0 - a) * image[row, column] + a * image[row, column + 1]
-    below = (1.0 - a) * image[row + 1, column] + a * image[row + 1, column + 1]
-    value: float = (1.0 - b) * above + b * below
-    return value
+@dataclasses.dataclass(frozen=True, eq=False)
+class Axes:
+    """Expected end in a map, and the unit vector along the shaft towards it."""
+
+    point: Array
+    direction: Array
+
+    @property
+    def across(self) -> Array:
+        """Unit vector across the shaft."""
+        return np.array([-self.direction[1], self.direction[0]])
+
+    def sample(self, image: Map, along: Array, across: Array) -> Array:
+        """Return a map at distances along and across the shaft, which are broadcast [px].
+
+        The values are interpolated, and 0 outside the map.
+        """
+        columns = self.point[0] + along * self.direction[0] - across * self.direction[1]
+        rows = self.point[1] + along * self.direction[1] + across * self.direction[0]
+        return np.asarray(map_coordinates(image, [rows, columns], np.float64, order=1))
 
 
-@inlined
-def _on_line(image: Map, point: Array, direction: Array, along: float, across: float) -> float:
-    x = point[0] + along * direction[0] - across * direction[1]
-    y = point[1] + along * direction[1] + across * direction[0]
-    return _at(image, x, y)
+class Line(NamedTuple):
+    """Line of the shaft: its distance across `Axes` at the expected end [px], and its slope."""
+
+    offset: float
+    slope: float
+
+    def at(self, along: Array) -> Array:
+        """Return the distances across at distances along [px]."""
+        return np.asarray(self.offset + self.slope * along)
 
 
-@compiled
-def _best_line(
-    shaft: Map, point: Array, direction: Array, back: float, across: float, width: float
-) -> tuple[float, float]:
-    """Return offset [px] and slope of the line with the largest sum of shaft probability."""
-    best, offset, slope = -1.0, 0.0, 0.0
+class LineFit(NamedTuple):
+    """Fitted line, its standard deviations at the end [px, rad], and its mean probability."""
+
+    line: Line
+    sigma: float
+    sigma_angle: float
+    certainty: float
+
+
+def _best_line(shaft: Map, axes: Axes, back: float, across: float, width: float) -> Line:
+    """Return the line with the largest sum of shaft probability."""
     pitch = 0.5 * width
-    steps = int(math.ceil(across / pitch))
+    steps = math.ceil(across / pitch)
     # From one slope to the next, the far end of the line moves by at most the pitch.
-    slopes = int(math.ceil(FIT.largest_slope * back / pitch))
-    for j in range(-steps, steps + 1):
-        for k in range(-slopes, slopes + 1):
-            lean = FIT.largest_slope * k / slopes
-            total = 0.0
-            s = -back
-            while s <= 0.0:
-                total += _on_line(shaft, point, direction, s, j * pitch + lean * s)
-                s += pitch
-            if total > best:
-                best, offset, slope = total, j * pitch, lean
-    return offset, slope
+    leans = math.ceil(FIT.largest_slope * back / pitch)
+    offsets = pitch * np.arange(-steps, steps + 1)
+    slopes = FIT.largest_slope / leans * np.arange(-leans, leans + 1)
+    along = np.arange(-back, _ROUNDING, pitch, dtype=np.float64)
+    lines = offsets[:, None, None] + slopes[:, None] * along
+    sums = axes.sample(shaft, along, lines).sum(axis=-1)
+    best = np.unravel_index(sums.argmax(), sums.shape)
+    return Line(float(offsets[best[0]]), float(slopes[best[1]]))
 
 
-@compiled
 def _fit_line(
-    shaft: Map,
-    point: Array,
-    direction: Array,
-    offset: float,
-    slope: float,
-    end: float,
-    back: float,
-    width: float,
-) -> tuple[float, float, float, float, float, float]:
-    """Fit a line to the centre of the shaft, by weighted least squares.
+    shaft: Map, axes: Axes, line: Line, *, end: float, back: float, width: float
+) -> LineFit | None:
+    """Fit a line to the centre of the shaft near a line, by weighted least squares.
 
-    Return the length of the shaft [px], offset and slope, their standard deviations at the end, and
-    the mean probability along the line.
+    None is returned for a shaft that is too short.
     """
-    count = int(back)
-    positions, middles, weights = np.empty(count), np.empty(count), np.empty(count)
-    certainty = breadth = 0.0
-    for i in range(count):
-        s = end - i
-        centre = offset + slope * s
-        mass = moment = second = 0.0
-        t = -width
-        while t <= width:
-            value = _on_line(shaft, point, direction, s, centre + t)
-            mass += value
-            moment += value * t
-            second += value * t * t
-            t += 0.5
-        positions[i], weights[i] = s, min(0.5 * mass / width, 1.0)
-        middles[i] = centre
-        if mass > 0.0:
-            middles[i] += moment / mass
-            breadth += weights[i] * (second / mass - (moment / mass) ** 2)
-        certainty += _on_line(shaft, point, direction, s, centre)
-    total = weights.sum()
-    certainty /= count
-    if total < 2.0:
-        return total, offset, slope, 0.0, 0.0, certainty
-    mean = (weights * positions).sum() / total
-    middle = (weights * middles).sum() / total
-    spread = (weights * (positions - mean) ** 2).sum() / total
-    lean = (weights * (positions - mean) * (middles - middle)).sum() / (total * spread)
-    residuals = middles - middle - lean * (positions - mean)
-    variance = (weights * residuals * residuals).sum() / total
+    along = end - np.arange(int(back), dtype=np.float64)
+    beside = np.arange(-width, width + _ROUNDING, 0.5)
+    values = axes.sample(shaft, along[:, None], line.at(along)[:, None] + beside)
+    mass = values.sum(axis=1)
+    weights = np.minimum(0.5 * mass / width, 1.0)
+    total = float(weights.sum())
+    if total < max(FIT.least_line_widths * width, 2.0):
+        return None
+    shares = values / np.maximum(mass, _ROUNDING)[:, None]
+    shifts = shares @ beside
+    breadth = float(weights @ (shares @ beside**2 - shifts**2)) / total
+    middles = line.at(along) + shifts
+    mean, middle = weights @ along / total, weights @ middles / total
+    spread = weights @ (along - mean) ** 2 / total
+    slope = weights @ ((along - mean) * (middles - middle)) / (total * spread)
+    variance = weights @ (middles - middle - slope * (along - mean)) ** 2 / total
     # Disturbances of the centre are correlated over about the width of the needle.
     independent = max(total / width - 2.0, 1.0)
     # The variance of the probability across one shaft is width^2 / 12, with blurred edges up to
     # twice that. A broader distribution may be two lines, such as a needle beside its shadow.
-    doubt = max(breadth / total - 2.0 * width * width / 12.0, 0.0)
-    sigma = math.sqrt(doubt + variance / independent * (1.0 + (end - mean) ** 2 / spread))
-    sigma_angle = math.sqrt(variance / independent / spread)
-    return total, middle - lean * mean, lean, sigma, sigma_angle, certainty
+    doubt = max(breadth - 2.0 * width * width / 12.0, 0.0)
+    return LineFit(
+        Line(float(middle - slope * mean), float(slope)),
+        math.sqrt(doubt + variance / independent * (1.0 + (end - mean) ** 2 / spread)),
+        math.sqrt(variance / independent / spread),
+        float(axes.sample(shaft, along, line.at(along)).mean()),
+    )
 
 
-@compiled
 def _end_on_line(
-    ends: Map,
-    point: Array,
-    direction: Array,
-    offset: float,
-    slope: float,
-    along: float,
-    width: float,
+    ends: Map, axes: Axes, line: Line, along: float, width: float
 ) -> tuple[float, float]:
     """Return the median of the position of the end along the line, and its standard deviation [px].
 
@@ -268,55 +251,20 @@ def _end_on_line(
     `hidden_end` is uniform over the window, so that a map without an end gives a wide spread.
     """
     count = 2 * int(along) + 1
-    density = np.empty(count)
-    for i in range(count):
-        s = i - along
-        centre = offset + slope * s
-        total = 0.0
-        t = -width
-        while t <= width:
-            total += _on_line(ends, point, direction, s, centre + t)
-            t += 1.0
-        density[i] = total
-    _keep_densest_interval(density, width)
+    positions = np.arange(count, dtype=np.float64) - along
+    beside = np.arange(-width, width + _ROUNDING)
+    lines = line.at(positions)[:, None] + beside
+    density = axes.sample(ends, positions[:, None], lines).sum(axis=1)
+    # A wide window may show two ends, and their median would be at neither.
+    about = min(2 * int(FIT.around_widths * width) + 1, count)
+    first = int(np.convolve(density, np.ones(about), "valid").argmax())
+    density[:first] = density[first + about :] = 0.0
     known = density.sum()
     flat = max(FIT.hidden_end, 1.0 - known) if known < FIT.hidden_end else FIT.hidden_end
-    for i in range(count):
-        density[i] = (density[i] / max(known, FIT.hidden_end)) * (
-            1.0 - FIT.hidden_end
-        ) + flat / count
-    density /= density.sum()
-    early, late = _quantile(density, 1.0 - _ONE_SIGMA), _quantile(density, _ONE_SIGMA)
-    return _quantile(density, 0.5) - along, 0.5 * (late - early)
-
-
-@compiled
-def _keep_densest_interval(density: Array, width: float) -> None:
-    """Set the density to 0 outside the interval with the largest sum.
-
-    A wide window may show two ends, and their median would be at neither.
-    """
-    count = 2 * int(FIT.around_widths * width) + 1
-    if len(density) <= count:
-        return
-    total = most = density[:count].sum()
-    first = 0
-    for i in range(1, len(density) - count + 1):
-        total += density[i + count - 1] - density[i - 1]
-        if total > most:
-            first, most = i, total
-    density[:first] = 0.0
-    density[first + count :] = 0.0
-
-
-@compiled
-def _quantile(density: Array, level: float) -> float:
-    """Return the quantile of a density, in samples."""
-    below = 0.0
-    for i in range(len(density)):
-        # A sample covers the pixel around it.
-        if level <= below + density[i]:
-            position: float = i - 0.5 + (level - below) / density[i]
-            return position
-        below += density[i]
-    return len(density) - 0.5
+    density *= (1.0 - FIT.hidden_end) / max(known, FIT.hidden_end)
+    density += flat / count
+    # A sample covers the pixel around it.
+    below = np.concatenate([[0.0], np.cumsum(density)]) / density.sum()
+    levels = (1.0 - _ONE_SIGMA, 0.5, _ONE_SIGMA)
+    early, median, late = np.interp(levels, below, np.arange(count + 1) - 0.5)
+    return float(median - along), float(0.5 * (late - early))
