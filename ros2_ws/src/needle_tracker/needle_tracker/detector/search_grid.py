@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
-from needle_core.compiled import compiled
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
@@ -126,8 +126,9 @@ def make_search_grid(
     offsets = np.arange(-half, half + 1)
     tilts = GRID.angle_pitch * np.hypot(offsets[:, None], offsets)
     cells = np.argwhere(tilts <= np.minimum(limit, widest)[:, None, None])
-    seen = np.empty((len(cells), 6))
-    _interpolate(_lattice(cameras, distances, side), cells, GRID.lattice, seen)
+    places = cells.T / GRID.lattice
+    lattice = np.moveaxis(_lattice(cameras, distances, side), -1, 0)
+    seen = np.stack([map_coordinates(values, places, order=1) for values in lattice], axis=-1)
     border, inside = GRID.border_px, (seen[:, 4:] >= 0.0).all(axis=1)
     for i, each in enumerate(cameras):
         for j, size in enumerate((each.camera.width, each.camera.height)):
@@ -167,25 +168,6 @@ def _lattice(
     pixels = [np.nan_to_num(each.project(points), nan=-1.0) for each in cameras]
     depths = [each.camera.window.depth(points)[..., None] for each in cameras]
     return np.concatenate([*pixels, *depths], axis=-1)
-
-
-@compiled
-def _interpolate(lattice: Array, cells: Indices, step: int, values: Array) -> None:
-    """Write the values of cells, shape (n, 6), interpolated between the points of a lattice."""
-    last = np.array(lattice.shape[:3]) - 2
-    corner, share = np.empty(3, np.int64), np.empty(3)
-    for c in range(len(cells)):
-        for axis in range(3):
-            corner[axis] = min(cells[c, axis] // step, last[axis])
-            share[axis] = cells[c, axis] / step - corner[axis]
-        values[c] = 0.0
-        for k in range(8):
-            i, j, m = k // 4, k // 2 % 2, k % 2
-            weight = share[0] if i else 1.0 - share[0]
-            weight *= share[1] if j else 1.0 - share[1]
-            weight *= share[2] if m else 1.0 - share[2]
-            for v in range(values.shape[1]):
-                values[c, v] += weight * lattice[corner[0] + i, corner[1] + j, corner[2] + m, v]
 
 
 def _boxes(pixels: NDArray[np.float32], starts: Indices) -> Array:
