@@ -20,8 +20,6 @@ Image = NDArray[np.uint8]
 _NOISE = 12.0  # grey levels
 _QUALITY = 20  # of JPEG
 _GAIN = 0.4
-SETTLED = 3
-"""First pairs of a sequence that do not count: a tracker without insertion needs three pairs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,8 +128,7 @@ def tracked_pairs(
 ) -> Iterator[TrackedPair]:
     """Yield the tracker's results for the pairs of a sequence.
 
-    With a needle, the first `SETTLED` pairs are processed and not yielded, nor are pairs without
-    all of its last 10 mm in both images.
+    Pairs without all of a needle's last 10 mm in both images are processed and not yielded.
 
     Parameters
     ----------
@@ -156,5 +153,5 @@ def tracked_pairs(
         tip = tracker.process(left, right, None if known is KnownInput.NOTHING else insertion).tip
         if not sequence.scene.look.needle:
             yield TrackedPair(sequence.scene, known, tip, None)
-        elif number >= SETTLED and sequence.seen[number].min() >= 1.0:
+        elif sequence.seen[number].min() >= 1.0:
             yield TrackedPair(sequence.scene, known, tip, sequence.tips[number])

@@ -57,8 +57,8 @@ The output is a CSV file with a line per pair:
 With --insertion a single pair is enough for a tip. The stage's zero and scale may be wrong
 (stage_zero_sigma, stage_scale_sigma): both are estimated and printed. Below an insertion of 8 mm
 (entry_zone) the needle does not have to be visible.
-Without --insertion a needle is accepted only after its end has moved like a needle: at rest it
-cannot be distinguished from an old needle track.
+Without --insertion an end that both views show clearly is the needle's, another one only after it
+has moved like a needle.
 --params has the parameters of the node stereo_tracker; those for topics have no effect.
 
 examples:

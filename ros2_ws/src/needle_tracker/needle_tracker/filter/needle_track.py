@@ -317,13 +317,13 @@ class NeedleTrack:
         the insertion is known, a line without an end is fitted where the stage predicts the end, so
         that its motion is no evidence.
 
-        P(else) / P(needle) = (e^-motion + e^-end [e^-motion] + e^-shadow) e^-length
+        P(else) / P(needle) = (e^(-other - motion) + e^-end [e^-motion] + e^-shadow) e^-length
         """
         evidence = self.recent_evidence + self.earlier_evidence
         no_end = -_bounded(FILTER.prior_log_odds + evidence)
         if self.insertion is None:
             no_end -= self.motion_log_odds
-        others = _log_sum(-self.motion_log_odds, no_end)
+        others = _log_sum(-FILTER.other_log_odds - self.motion_log_odds, no_end)
         shadow = -FILTER.shadow_log_odds
         if self.insertion is not None:
             # A shadow is about as long as its needle, other objects end at any distance.

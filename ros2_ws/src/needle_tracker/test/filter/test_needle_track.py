@@ -56,6 +56,16 @@ def test_an_object_at_rest_while_the_stage_moves_is_no_needle(
     assert moving.log_odds() > ACCEPTED
 
 
+def test_without_the_insertion_only_a_clear_end_is_the_needle_at_once(
+    settings: StereoTrackerParameters,
+) -> None:
+    accepted = math.log(FILTER.accepted / (1.0 - FILTER.accepted))
+    clear, unclear = (
+        NeedleTrack.begin(sighting(0.05, evidence), None, settings) for evidence in (4.0, 1.0)
+    )
+    assert clear.log_odds() > accepted > unclear.log_odds()
+
+
 def test_without_the_insertion_a_moving_object_is_the_needle(
     settings: StereoTrackerParameters,
 ) -> None:

@@ -71,10 +71,6 @@ def test_a_rendered_needle_is_measured_to_some_tenths_of_a_millimetre(
         for insertion, _, left, right in exposures
     ]
     errors = tip_errors(measured, [pose for _, pose, _, _ in exposures])
-    if not insertion_known:
-        # It must move before it is accepted.
-        assert np.all(np.isnan(errors[0]))
-        errors, measured, exposures = errors[2:], measured[2:], exposures[2:]
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.2e-3
     assert all(m.state is TrackState.TRACKING for m in measured)
     for m, error, (_, pose, _, _) in zip(measured, errors, exposures, strict=True):
@@ -147,7 +143,7 @@ def test_no_function_is_compiled_after_the_warm_up(
 
     tracker.warm_up()
     before = compiled_for()
-    assert len(before) > 10
+    assert before["needle_tracker.optics.refraction._project"] == 1
     for length in (0.012, 0.11):
         images = draw_pair(arc(length, 4.0, 0.5))
         for insertion in (length, None):
