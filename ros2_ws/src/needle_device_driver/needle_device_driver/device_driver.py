@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL_ERROR
 from needle_core.component import (
     Actions,
     Component,
@@ -35,8 +35,6 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 _NO_DRIVES = "waiting for the drives"
 _REPLY_TIMEOUT = 0.75 * PERIOD
 _SEARCH_PERIOD = 0.25
-EXIT_BROKEN = 3
-"""The cycle raised an error: the axes are no longer controlled."""
 # A cycle is late if its delay exceeds this share of a period.
 _LATE = 0.5
 
@@ -181,7 +179,7 @@ class DeviceDriver(Component):
                 yield from self._device.report(at)
                 yield from self._send()
                 if ends:
-                    yield Exit(EXIT_BROKEN, text)
+                    yield Exit(EXIT_INTERNAL_ERROR, text)
                 raise
             yield from self._send()
 

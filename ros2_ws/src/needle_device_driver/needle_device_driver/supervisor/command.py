@@ -265,7 +265,7 @@ class CommandHandler:
         self._hold = hold
         self._limits = limits
         self._on_path = False
-        self.stamps = CommandStamps(2.0 * limits.tip_age_limit)
+        self.stamps = CommandStamps()
         self.refused = 0
         self.newest_ns = 0
 

@@ -170,19 +170,17 @@ class DeviceCore:
         self.change_state(Trigger.CONFIGURE, "configured")
         return ""
 
-    def deconfigure(self) -> Procedure[bool]:
-        """Switch the axes off and release them; return whether the state was DISABLED."""
+    def deconfigure(self) -> Procedure[None]:
+        """Switch the axes off and release them."""
         if self.configured:
             self.configured = False
             try:
                 yield from self._axes.close()
             except AxisError as error:
                 self.fail(str(error), error.rule)
-        if self.state is not State.DISABLED:
-            return False
-        self.snapshot = None
-        self.change_state(Trigger.DECONFIGURE, "deconfigured")
-        return True
+        if self.state is State.DISABLED:
+            self.snapshot = None
+            self.change_state(Trigger.DECONFIGURE, "deconfigured")
 
     def reset(self, now: float) -> Procedure[str]:
         """Leave FAULT or ESTOPPED with the axes off; return the remaining problem."""

@@ -150,16 +150,11 @@ class MotionRun:
         # Start at the last set-point: a motor may rest beside it, and a path from the measured
         # position could begin with a jump of the set-point.
         start = at.insertion.set_point, at.rotation.set_point
-        if self.activity is Activity.RETRACTION:
-            legs = slowed_legs(start, self._legs, max_speed=self._limits.retraction_speed)
-        else:
-            legs = slowed_legs(
-                start,
-                self._legs,
-                max_speed=self._limits.max_speed,
-                max_rotation_rate=self._limits.max_rotation_rate,
-            )
-        return CoordinatedMotion(start, legs)
+        retracts, limits = self.activity is Activity.RETRACTION, self._limits
+        speed = limits.retraction_speed if retracts else limits.max_speed
+        return CoordinatedMotion(
+            start, slowed_legs(start, self._legs, speed, limits.max_rotation_rate)
+        )
 
     def _distance_to_end(self, at: PairSnapshot) -> tuple[float, float]:
         end = self._legs[-1]

@@ -91,15 +91,12 @@ class MotionSupervisor:
         at = self._core.snapshot
         return None if at is None or at.age(now) > self._limits.reply_age_limit else at
 
-    def is_held(self, now: float) -> bool:
-        """Return whether the owner's press is fresh and its speed is above 0."""
-        return self._hold.is_fresh(now) and self._hold.speed_scale > 0.0
-
     def may_move(self, now: float) -> bool:
         """Return whether `drive` would continue the motion under way."""
         if self._core.activity is Activity.HOMING:
             return True
-        return self._core.activity is not Activity.NONE and self.is_held(now)
+        is_held = self._hold.is_fresh(now) and self._hold.speed_scale > 0.0
+        return self._core.activity is not Activity.NONE and is_held
 
     def status(
         self, now: float, source: str = "", *, simulated: bool | None = None
@@ -140,13 +137,11 @@ class MotionSupervisor:
         self.observe(now)
         return ServiceResult(True, "configured")
 
-    def deconfigure(self) -> Procedure[ServiceResult]:
+    def deconfigure(self) -> Procedure[None]:
         """Stop, switch the axes off and release them; a fault or emergency stop remains."""
         if self._core.state in (State.HOLDING, State.MOVING):
             self._disable()
-        if not (yield from self._core.deconfigure()):
-            return ServiceResult(False, f"the device is {self._core.state.value}")
-        return ServiceResult(True, "deconfigured")
+        yield from self._core.deconfigure()
 
     def note_time(self, ros_ns: int, now: float) -> None:
         """Note that ROS time is `ros_ns` [ns]; call it in each cycle."""

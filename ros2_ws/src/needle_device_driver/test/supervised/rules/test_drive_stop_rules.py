@@ -157,7 +157,8 @@ def test_drive_watchdog_is_armed_last_and_disarmed_at_exit() -> None:
     bench = DriveBench().moving()
     # A drive that does not report off keeps its watchdog.
     bench.insertion.syncs = False
-    assert not bench.run(bench.supervisor.deconfigure()).success
+    bench.run(bench.supervisor.deconfigure())
+    assert bench.state == "FAULT"
     assert "insertion axis: does not confirm power-off" in bench.notices[-1].text
     assert bench.insertion.value(0x1016, 1) == 127 << 16 | 100
     assert (bench.rotation.value(0x1016, 1), bench.rotation.state) == (0, "disabled")
