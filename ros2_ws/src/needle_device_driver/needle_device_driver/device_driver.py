@@ -110,7 +110,6 @@ class DeviceDriver(Component):
             axes["rotation"],
             settings,
             feedback_delay=math.ceil(response_time / PERIOD),
-            is_switching=lambda: any(drives.needs_cycles for drives in self.drives),
         )
         self._device = DeviceInterface(
             self.supervisor, name, simulated=None, not_ready=lambda: self.waiting

@@ -195,7 +195,7 @@ class DeviceCore:
                 self.poll(now), now, self._limits, require_power=False, require_home=False
             )
             if problem is not None:
-                return problem[1]
+                return problem.text
             trigger, reason = Trigger.RESET, "reset; enable to continue"
         self._fault = self._stop_failures = ""
         self.change_state(trigger, reason)
@@ -315,8 +315,7 @@ class DeviceCore:
 
     def drive(self, period: float, speed_scale: float, now: float) -> None:
         """Order the set-points of the next `period` [s] of the motion under way."""
-        if self._run is None:
-            return
+        assert self._run is not None
         at = self.poll(now)
         if not at.answered:
             # A missing answer may mean a lost set-point: do not send another. An axis that stays
@@ -324,7 +323,7 @@ class DeviceCore:
             return
         problem = self._run.problem(at)
         if problem is not None:
-            self.fail(problem[1], problem[0])
+            self.fail(problem.text, problem.rule)
             return
         set_point = self._run.advance(at, period, speed_scale)
         if set_point is None:
@@ -366,8 +365,8 @@ class DeviceCore:
             text = "blocked when it was stopped; switched off until the next motion"
             self.explain(f"{at.released_after_block}: {text}", Rule.FOLLOWING_ERROR)
         if problem is not None:
-            self.watchdog_trips += problem[0] is Rule.REPLY_AGE
-            self.fail(problem[1], problem[0])
+            self.watchdog_trips += problem.rule is Rule.REPLY_AGE
+            self.fail(problem.text, problem.rule)
 
     def _check_stopped(self, at: PairSnapshot, now: float) -> None:
         # In FAULT, silence may be the fault itself.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from needle_core.diagnostics import Level, sanitize
 from needle_core.messages import HoldState, Trajectory
 from needle_core.status_messages import DeviceStatus
@@ -36,8 +34,6 @@ class MotionSupervisor:
         The bounds of the rules.
     feedback_delay : int
         Number of cycles until a set-point shows in the feedback.
-    is_switching : callable, optional
-        Returns whether an axis still executes an order other than a set-point.
     """
 
     def __init__(
@@ -47,9 +43,7 @@ class MotionSupervisor:
         limits: SafetyLimits,
         *,
         feedback_delay: int = 0,
-        is_switching: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._is_switching = is_switching
         self._axes = AxisPair(insertion, rotation)
         self._limits = limits
         self._hold = Hold(limits.hold_timeout)
@@ -207,7 +201,7 @@ class MotionSupervisor:
             return ServiceResult(True, "already enabled")
         if self._core.state is not State.DISABLED:
             return self._wrong_state(State.DISABLED)
-        if self._is_switching():
+        if self._axes.needs_cycles:
             return ServiceResult(False, _SWITCHING)
         if error := self._core.power_on():
             return ServiceResult(False, error)
@@ -232,7 +226,7 @@ class MotionSupervisor:
             return self._wrong_state(State.DISABLED)
         if not self._needle_out:
             return ServiceResult(False, "confirm first that the needle is out (confirm_needle_out)")
-        if self._is_switching():
+        if self._axes.needs_cycles:
             return ServiceResult(False, _SWITCHING)
         if error := (yield from self._core.start_homing()):
             return ServiceResult(False, error)
