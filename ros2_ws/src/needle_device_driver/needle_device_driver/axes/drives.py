@@ -81,11 +81,9 @@ class CyclicAxis(Axis):
         if self._limits_due:
             raise AxisError(f"{self.name} axis has no software limits yet")
 
-    def _check_move(self, target: float, speed: float, last: int, *, ready: bool) -> int:
+    def _check_move(self, target: float, speed: float, last: int) -> int:
         """Return the counts of a set-point that may follow the `last` one [counts]."""
         self._refuse_fault()
-        if not ready:
-            raise AxisError(f"{self.name} axis is not ready to move")
         settings, counts = self._settings, self._settings.counts(target)
         lower, upper = settings.limits_counts if self._homed else self._counter
         if not lower <= counts <= upper:

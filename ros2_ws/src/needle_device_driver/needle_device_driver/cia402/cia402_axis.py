@@ -128,7 +128,7 @@ class Cia402Axis(CyclicAxis):
     def start_move(self, target: float, speed: float) -> None:
         """Set the set-point of the next cycle; it implies the speed."""
         machine = self._machine
-        counts = self._check_move(target, speed, machine.target, ready=machine.ready)
+        counts = self._check_move(target, speed, machine.target)
         step, machine.target = abs(counts - machine.target), counts
         self._speed.command(step / self._settings.counts_per_unit / PERIOD)
 

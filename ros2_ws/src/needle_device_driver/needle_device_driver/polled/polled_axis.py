@@ -97,7 +97,7 @@ class PolledAxis(CyclicAxis):
 
     def start_move(self, target: float, speed: float) -> None:
         """Set the set-point of the next cycle; it implies the speed."""
-        counts = self._check_move(target, speed, self._target, ready=self._ready)
+        counts = self._check_move(target, speed, self._target)
         if counts != self._target:
             # A repeated set-point would replace the drive's unfinished order with a slower one.
             step = abs(counts - self._target)
