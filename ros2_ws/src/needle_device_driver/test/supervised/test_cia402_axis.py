@@ -76,12 +76,12 @@ def again(bench: DriveBench, position: int, home_after: int) -> DriveBench:
     return bench
 
 
-def test_homing_ends_by_target_reached_if_attained_is_always_set() -> None:
+@pytest.mark.parametrize("under_way", [0x1000, 0x0400])
+def test_homing_ends_when_home_is_attained_and_the_target_reached(under_way: int) -> None:
     bench = again(DriveBench(), 3000, 20)
     bench.wait(4)
     for _ in range(15):
-        # Under way: attained once, not at the target.
-        bench.insertion.more_status = 0x1000
+        bench.insertion.more_status = under_way
         bench.wait()
         assert not bench.is_homed()
     bench.wait(20)
