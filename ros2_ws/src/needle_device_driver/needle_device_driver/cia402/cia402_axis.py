@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from needle_device_driver.axes.axis import PERIOD, AxisSnapshot
 from needle_device_driver.axes.drives import CyclicAxis
-from needle_device_driver.axes.link import DriveError, LinkError, raised_as_axis_error
+from needle_device_driver.axes.link import DriveError, raised_as_axis_error
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
     FOLLOWING_ERROR,
@@ -252,9 +252,6 @@ class Cia402Axis(CyclicAxis):
     def _write_limits(self) -> Procedure[None]:
         try:
             yield from write_limits(self._access, self._settings, homed=True)
-        except LinkError:
-            # Reported as the loss of the link.
-            return
         except DriveError as error:
             self._machine.problem = str(error)
             return
@@ -267,8 +264,6 @@ class Cia402Axis(CyclicAxis):
     @property
     def _fault(self) -> Problem | None:  # noqa: PLR0911 - each return is a fault
         monitor, machine, homing = self.monitor, self._machine, self._homing
-        if not self._configured:
-            return None
         if self._link.lost:
             return Problem(Rule.LINK_LOSS, self._link.lost)
         if self._link.other_master:

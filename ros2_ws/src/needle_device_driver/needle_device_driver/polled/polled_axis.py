@@ -229,8 +229,6 @@ class PolledAxis(CyclicAxis):
     @property
     def _fault(self) -> Problem | None:
         at = self._at
-        if not self._configured:
-            return None
         for rule, text in (
             (Rule.LINK_LOSS, self._link.lost),
             (Rule.DRIVE_REBOOT, "the drive restarted; its home is lost" if at.rebooted else ""),

@@ -91,9 +91,8 @@ class DeviceCore:
 
     @property
     def retraction_distance(self) -> float:
-        """Longest allowed retraction [m]; 0 without a snapshot."""
-        if self.snapshot is None:
-            return 0.0
+        """Longest allowed retraction [m]."""
+        assert self.snapshot is not None
         insertion = self.snapshot.insertion
         return insertion.position - self._retraction_bound.target(insertion)
 
@@ -378,8 +377,7 @@ class DeviceCore:
     def finish_completed_motion(self) -> None:
         """End a homing, step or retraction that has arrived."""
         at = self.snapshot
-        if at is None:
-            return
+        assert at is not None
         if self.activity is Activity.HOMING:
             if at.homed and not (at.insertion.moving or at.rotation.moving):
                 self._end_motion("", stop=False)
