@@ -152,14 +152,6 @@ def test_a_lagging_axis_catches_up_within_two_cycles(reference: int, speed: int)
     assert script.take()[1] == f"SPA={speed + speed % 2}"
 
 
-def test_an_axis_rests_at_its_target_in_position_tracking() -> None:
-    script = Script().ready()
-    script.protocol.move_to("insertion", 50, 100)
-    script.say(":::")
-    assert script.answered("20.0000 21.0000 140.0000 0.0000").moving
-    assert not script.answered("49.0000 50.0000 140.0000 0.0000").moving
-
-
 def test_a_limit_ends_position_tracking_but_not_that_of_newer_orders() -> None:
     script = Script().ready()
     stopped = "50.0000 50.0000 8.0000 3.0000"

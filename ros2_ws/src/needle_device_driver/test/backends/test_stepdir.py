@@ -67,19 +67,11 @@ def test_orders_and_a_request_have_these_bytes() -> None:
     assert board.states == [(7, {"insertion": insertion, "rotation": rotation})]
 
 
-@pytest.mark.parametrize(
-    ("state", "found"),
-    [
-        (b"1,5,17,0,17", DriveReply(5, moving=False, powered=True, timed_out=True)),
-        (b"0,5,0,0,17", DriveReply(5, moving=False, powered=False, rebooted=True)),
-        (b"2,5,17,0,17", DriveReply(5, moving=False, powered=True, conflict=True)),
-        (b"9,5,16,0,0", DriveReply(5, moving=False, powered=False, fault="reports fault 9")),
-    ],
-)
-def test_faults_of_the_board(state: bytes, found: DriveReply) -> None:
+def test_a_board_with_one_axis_is_stopped_by_its_dead_man() -> None:
     board = Board("insertion")
     board.protocol.request(1)
-    board.say(b"0,S," + state)
+    board.say(b"0,S,1,5,17,0,17")
+    found = DriveReply(5, moving=False, powered=True, timed_out=True)
     assert board.states == [(1, {"insertion": found})]
 
 

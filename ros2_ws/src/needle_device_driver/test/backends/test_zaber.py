@@ -197,15 +197,6 @@ def test_a_restart_shows_behind_a_higher_flag() -> None:
     assert line.commands[-1] == "1 1 warnings clear"
 
 
-def test_switches_follow_their_requests() -> None:
-    line = Line().ready()
-    for number, state in ((4, "0"), (5, "1")):
-        line.protocol.request(number)
-        line.say(f"@01 1 {1 + number:02} OK BUSY -- 900", f"@02 1 {1 + number:02} OK BUSY -- 900")
-        line.say(f"@01 1 {34 + number} OK BUSY -- {state}")
-    assert (line.state().home_switch, line.state().inner_switch) == (False, True)
-
-
 COMPLETE = (
     "@01 1 08 OK IDLE -- 900",
     "@01 1 41 OK IDLE -- 0",
