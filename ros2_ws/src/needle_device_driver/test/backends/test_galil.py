@@ -183,16 +183,6 @@ def test_the_watchdog_and_a_restart_show() -> None:
     assert script.answered(time=280, line=-1).rebooted
 
 
-def test_an_acknowledged_stop_code_is_no_fault_until_the_axis_was_on() -> None:
-    script = Script().ready()
-    off, on = (f"0.0000 0.0000 {bits}.0000 8.0000" for bits in (44, 12))
-    assert not script.answered(off).fault
-    assert not script.answered(on).fault
-    assert script.answered(off).fault
-    script.run(script.protocol.clear_fault("insertion"))
-    assert not script.answered(off).fault
-
-
 def test_a_refused_order_is_a_fault_with_its_reason() -> None:
     script = Script().ready()
     script.protocol.move_to("insertion", 1, 100)
