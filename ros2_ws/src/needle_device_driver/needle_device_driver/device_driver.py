@@ -146,8 +146,8 @@ class DeviceDriver(Component):
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Check for another device; if there is one before the set-up, exit."""
         yield from self._guarded(self._device.on_peers)(peers, at)
-        if self.searches and self._device.conflict:
-            yield Exit(EXIT_BAD_INPUT, self._device.conflict)
+        if self.searches and self.supervisor.conflict:
+            yield Exit(EXIT_BAD_INPUT, self.supervisor.conflict)
 
     def on_stop(self, at: Moment) -> Actions:
         """Stop both axes, switch them off, and exit."""

@@ -122,9 +122,9 @@ def check_form(command: Trajectory) -> Problem | None:
 
 def _check_times(command: Trajectory) -> Problem | None:
     times = [point.time_from_start for point in command.points]
-    earliest = 0.0 if is_path(command) else math.nextafter(0.0, 1.0)
-    if not earliest <= times[0] or not times[-1] <= HARD_STEP_TIME_CAP:
-        wrong = times[0] if times[0] < earliest else times[-1]
+    begins = times[0] >= 0.0 if is_path(command) else times[0] > 0.0
+    if not begins or times[-1] > HARD_STEP_TIME_CAP:
+        wrong = times[-1] if begins else times[0]
         return Problem(
             Rule.COMMAND_FORM,
             f"time_from_start {wrong:g} s, expected > 0 s and at most {HARD_STEP_TIME_CAP:g} s",

@@ -34,6 +34,11 @@ class MotionSupervisor:
         The bounds of the rules.
     feedback_delay : int
         Number of cycles until a set-point shows in the feedback.
+
+    Attributes
+    ----------
+    conflict : str
+        Another device on the same topics; empty: there is none.
     """
 
     def __init__(
@@ -50,7 +55,7 @@ class MotionSupervisor:
         self._hold_notices = HoldNotices()
         self._estop_pressed = False
         self._needle_out = False
-        self._conflict = ""
+        self.conflict = ""
         self._core = DeviceCore(
             self._axes,
             limits,
@@ -161,9 +166,9 @@ class MotionSupervisor:
 
     def report_conflicting_device(self, conflict: str) -> None:
         """Fail if another device uses the same topics; an empty text means there is none."""
-        if conflict == self._conflict:
+        if conflict == self.conflict:
             return
-        self._conflict = conflict
+        self.conflict = conflict
         if conflict:
             # The confirmation may have been meant for the other device.
             self._needle_out = False
@@ -215,8 +220,8 @@ class MotionSupervisor:
         """Record a person's confirmation that the needle is out; the next step cancels it."""
         if self._core.activity is not Activity.NONE:
             return ServiceResult(False, f"a {self._core.activity.value} is under way")
-        if confirmed and self._conflict:
-            return ServiceResult(False, self._conflict)
+        if confirmed and self.conflict:
+            return ServiceResult(False, self.conflict)
         self._needle_out = confirmed
         return ServiceResult(True, "needle out" if confirmed else "needle not out")
 
@@ -276,8 +281,8 @@ class MotionSupervisor:
         self._commands.stamps.clear_rejections()
         if self._core.state not in (State.FAULT, State.ESTOPPED):
             return ServiceResult(True, "nothing to reset")
-        if self._conflict:
-            return ServiceResult(False, self._conflict)
+        if self.conflict:
+            return ServiceResult(False, self.conflict)
         if self._estop_pressed:
             return ServiceResult(False, "the emergency stop is still pressed")
         if not self._hold.is_off(now):
