@@ -63,6 +63,15 @@ def test_outer_end_is_negative_limit_or_home_switch() -> None:
             assert at.at_inner_switch is any(inputs & bits for bits in inner)
 
 
+def test_frames_of_a_wrong_length_are_counted_and_change_nothing() -> None:
+    bench = DriveBench().configured()
+    for number, cob_id in enumerate((0x181, 0x281, 0x701, 0x081), 1):
+        bench.bus.put(cob_id, b"\x01" * (cob_id != 0x701))
+        assert bench.link.bus_errors == number
+    bench.wait(2)
+    assert bench.state == "DISABLED"
+
+
 # ---- homing -------------------------------------------------------------------------------------
 
 
