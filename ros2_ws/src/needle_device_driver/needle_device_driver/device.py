@@ -73,8 +73,6 @@ class DeviceInterface:
     ----------
     simulated : bool or None
         As given; the component may change it.
-    conflict : str
-        Another device on the same topics; empty: there is none.
     """
 
     def __init__(
@@ -86,7 +84,6 @@ class DeviceInterface:
         not_ready: Callable[[], str] = lambda: "",
     ) -> None:
         self.simulated = simulated
-        self.conflict = ""
         self._supervisor = supervisor
         self._name = name
         self._not_ready = not_ready
@@ -166,12 +163,12 @@ class DeviceInterface:
         self._command_publishers = len(peers.publishers.get(COMMANDS, ()))
         others = [name for name in peers.publishers.get(STATUS, ()) if name != self._name]
         names = ", ".join(others)
-        self.conflict = (
+        conflict = (
             f"another device is running: {names} publishes {STATUS}; {CONFLICT_HINT}"
             if others
             else ""
         )
-        self._supervisor.report_conflicting_device(self.conflict)
+        self._supervisor.report_conflicting_device(conflict)
         return self.report(at)
 
     def report(self, at: Moment) -> Actions:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL_ERROR
 from needle_core.component import (
     Actions,
     Component,
@@ -35,8 +35,6 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 _NO_DRIVES = "waiting for the drives"
 _REPLY_TIMEOUT = 0.75 * PERIOD
 _SEARCH_PERIOD = 0.25
-EXIT_BROKEN = 3
-"""The cycle raised an error: the axes are no longer controlled."""
 # A cycle is late if its delay exceeds this share of a period.
 _LATE = 0.5
 
@@ -112,7 +110,6 @@ class DeviceDriver(Component):
             axes["rotation"],
             settings,
             feedback_delay=math.ceil(response_time / PERIOD),
-            is_switching=lambda: any(drives.needs_cycles for drives in self.drives),
         )
         self._device = DeviceInterface(
             self.supervisor, name, simulated=None, not_ready=lambda: self.waiting
@@ -149,8 +146,8 @@ class DeviceDriver(Component):
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Check for another device; if there is one before the set-up, exit."""
         yield from self._guarded(self._device.on_peers)(peers, at)
-        if self.searches and self._device.conflict:
-            yield Exit(EXIT_BAD_INPUT, self._device.conflict)
+        if self.searches and self.supervisor.conflict:
+            yield Exit(EXIT_BAD_INPUT, self.supervisor.conflict)
 
     def on_stop(self, at: Moment) -> Actions:
         """Stop both axes, switch them off, and exit."""
@@ -181,7 +178,7 @@ class DeviceDriver(Component):
                 yield from self._device.report(at)
                 yield from self._send()
                 if ends:
-                    yield Exit(EXIT_BROKEN, text)
+                    yield Exit(EXIT_INTERNAL_ERROR, text)
                 raise
             yield from self._send()
 

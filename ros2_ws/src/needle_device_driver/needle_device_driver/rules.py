@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from typing import NamedTuple
 
 
 class Rule(enum.Enum):
@@ -51,3 +52,10 @@ class Rule(enum.Enum):
     SOFTWARE_LIMITS = "software_limits"
     LOOK_AHEAD = "look_ahead"
     LOOP_HEARTBEAT = "loop_heartbeat"
+
+
+class Problem(NamedTuple):
+    """The rule that a command, a motion or an axis breaks, and how."""
+
+    rule: Rule
+    text: str

@@ -104,6 +104,11 @@ class Axis(abc.ABC):
 
     actuated = True
 
+    @property
+    def needs_cycles(self) -> bool:
+        """Whether the axis still executes an order other than a set-point."""
+        return False
+
     @abc.abstractmethod
     def configure(self) -> Procedure[None]:
         """Set the axis up; moves nothing."""
@@ -221,6 +226,11 @@ class AxisPair:
     def __init__(self, insertion: Axis, rotation: Axis) -> None:
         self.insertion = insertion
         self.rotation = rotation
+
+    @property
+    def needs_cycles(self) -> bool:
+        """Whether an axis still executes an order other than a set-point."""
+        return self.insertion.needs_cycles or self.rotation.needs_cycles
 
     def each(self, order: Callable[[Axis], None]) -> None:
         """Send an order to both axes.

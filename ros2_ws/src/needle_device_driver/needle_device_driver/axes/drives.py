@@ -14,10 +14,7 @@ from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.link import DriveError, Link, LinkError, raised_as_axis_error
 from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.procedure import Procedure, Wait
-from needle_device_driver.rules import Rule
-
-Fault = tuple[Rule, str]
-"""Rule behind a fault, and its text."""
+from needle_device_driver.rules import Problem, Rule
 
 
 class CyclicAxis(Axis):
@@ -54,11 +51,6 @@ class CyclicAxis(Axis):
         self._velocity = 0.0
         self._homing: Any = None
 
-    @property
-    @abc.abstractmethod
-    def needs_cycles(self) -> bool:
-        """Whether the drive still executes an order other than a set-point."""
-
     @abc.abstractmethod
     def transmit(self) -> Procedure[None]:
         """Send this cycle's order; raises `LinkError` if the link is lost."""
@@ -71,7 +63,7 @@ class CyclicAxis(Axis):
 
     @property
     @abc.abstractmethod
-    def _fault(self) -> Fault | None:
+    def _fault(self) -> Problem | None:
         """Reason why the axis refuses to move; None: it does not."""
 
     @abc.abstractmethod
@@ -82,18 +74,16 @@ class CyclicAxis(Axis):
         if not self._configured:
             raise AxisError(f"{self.name} axis is not configured")
         if (fault := self._fault) is not None:
-            raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
+            raise AxisError(f"{self.name} axis: {fault.text}", fault.rule)
 
     def _refuse_power(self) -> None:
         self._refuse_fault()
         if self._limits_due:
             raise AxisError(f"{self.name} axis has no software limits yet")
 
-    def _check_move(self, target: float, speed: float, last: int, *, ready: bool) -> int:
+    def _check_move(self, target: float, speed: float, last: int) -> int:
         """Return the counts of a set-point that may follow the `last` one [counts]."""
         self._refuse_fault()
-        if not ready:
-            raise AxisError(f"{self.name} axis is not ready to move")
         settings, counts = self._settings, self._settings.counts(target)
         lower, upper = settings.limits_counts if self._homed else self._counter
         if not lower <= counts <= upper:
@@ -173,11 +163,6 @@ class Drives(abc.ABC):
     def missing_optional_parts(self) -> tuple[str, ...]:
         """Optional parts that the drives lack and that a safety rule would use."""
         return ()
-
-    @property
-    def needs_cycles(self) -> bool:
-        """Whether a drive still executes an order other than a set-point."""
-        return any(axis.needs_cycles for axis in self.axes.values())
 
     @abc.abstractmethod
     def receive(self, batch: Sequence[Any]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 
@@ -77,9 +76,7 @@ class CoordinatedMotion:
         self._progress += rate * left
         if self._progress > 1.0 - 1e-9:
             self._progress = 1.0
-        if left < period:
-            return self._set_point_after(period)
-        return self._set_point(rate)
+        return self._set_point(period)
 
     def follow(self, insertion: float, max_rotation_rate: float, period: float) -> SetPoint:
         """Return the set-point for an insertion that was reached by hand.
@@ -98,7 +95,7 @@ class CoordinatedMotion:
             self._progress += step
             turn -= step * whole
             if self._progress < 1.0 or self._is_last:
-                return self._set_point_after(period)
+                return self._set_point(period)
             self._next_leg()
 
     def rotation_at(self, insertion: float) -> float:
@@ -132,13 +129,7 @@ class CoordinatedMotion:
             rotation + self._progress * (leg.rotation - rotation),
         )
 
-    def _set_point(self, rate: float) -> SetPoint:
-        leg, start = self._legs[self._leg], self._start
-        self._at = self._position()
-        speeds = rate * abs(leg.insertion - start[0]), rate * abs(leg.rotation - start[1])
-        return SetPoint(*self._at, *speeds)
-
-    def _set_point_after(self, period: float) -> SetPoint:
+    def _set_point(self, period: float) -> SetPoint:
         before, self._at = self._at, self._position()
         speeds = [abs(b - a) / period for a, b in zip(before, self._at, strict=True)]
         return SetPoint(*self._at, *speeds)
@@ -147,9 +138,8 @@ class CoordinatedMotion:
 def slowed_legs(
     start: tuple[float, float],
     legs: Sequence[Leg],
-    *,
     max_speed: float,
-    max_rotation_rate: float = math.inf,
+    max_rotation_rate: float,
 ) -> tuple[Leg, ...]:
     """Return the legs with durations that respect both bounds.
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from needle_device_driver.axes.axis import PERIOD, AxisSnapshot
-from needle_device_driver.axes.drives import CyclicAxis, Fault
-from needle_device_driver.axes.link import DriveError, LinkError, raised_as_axis_error
+from needle_device_driver.axes.drives import CyclicAxis
+from needle_device_driver.axes.link import DriveError, raised_as_axis_error
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
     FOLLOWING_ERROR,
@@ -32,7 +32,7 @@ from needle_device_driver.link.error_codes import HEARTBEAT_LOST, describe_error
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure, Wait
-from needle_device_driver.rules import Rule
+from needle_device_driver.rules import Problem, Rule
 
 # Number of cycles without an answer after which `close` stops waiting for the drive.
 _MAX_SILENT = 15
@@ -128,7 +128,7 @@ class Cia402Axis(CyclicAxis):
     def start_move(self, target: float, speed: float) -> None:
         """Set the set-point of the next cycle; it implies the speed."""
         machine = self._machine
-        counts = self._check_move(target, speed, machine.target, ready=machine.ready)
+        counts = self._check_move(target, speed, machine.target)
         step, machine.target = abs(counts - machine.target), counts
         self._speed.command(step / self._settings.counts_per_unit / PERIOD)
 
@@ -136,7 +136,6 @@ class Cia402Axis(CyclicAxis):
         """Send a quick stop immediately."""
         if not self.actuated or not self._configured:
             return
-        self._homing = None
         self._machine.stop()
         with raised_as_axis_error(self.name):
             self._send_order()
@@ -253,9 +252,6 @@ class Cia402Axis(CyclicAxis):
     def _write_limits(self) -> Procedure[None]:
         try:
             yield from write_limits(self._access, self._settings, homed=True)
-        except LinkError:
-            # Reported as the loss of the link.
-            return
         except DriveError as error:
             self._machine.problem = str(error)
             return
@@ -266,35 +262,33 @@ class Cia402Axis(CyclicAxis):
         return ObjectAccess(self._link, self._settings.node_id)
 
     @property
-    def _fault(self) -> Fault | None:  # noqa: PLR0911 - each return is a fault
+    def _fault(self) -> Problem | None:  # noqa: PLR0911 - each return is a fault
         monitor, machine, homing = self.monitor, self._machine, self._homing
-        if not self._configured:
-            return None
         if self._link.lost:
-            return Rule.LINK_LOSS, self._link.lost
+            return Problem(Rule.LINK_LOSS, self._link.lost)
         if self._link.other_master:
-            return Rule.ONE_MASTER, self._link.other_master
+            return Problem(Rule.ONE_MASTER, self._link.other_master)
         if self._speed.problem:
-            return Rule.AXIS_SPEED, self._speed.problem
+            return Problem(Rule.AXIS_SPEED, self._speed.problem)
         if monitor.rebooted:
-            return Rule.DRIVE_REBOOT, "the drive rebooted; its home position is lost"
+            return Problem(Rule.DRIVE_REBOOT, "the drive rebooted; its home position is lost")
         if (code := monitor.emergency) is not None:
             rule = Rule.DRIVE_WATCHDOG if code == HEARTBEAT_LOST else Rule.DRIVE_EMERGENCY
-            return rule, f"the drive reports {describe_error(code)}"
+            return Problem(rule, f"the drive reports {describe_error(code)}")
         state = machine.state
         # Without a motor the drive may be in any state.
         if self.actuated and state is not None and state in FAULTS:
-            return Rule.DRIVE_EMERGENCY, f"the drive is in {state.name}"
+            return Problem(Rule.DRIVE_EMERGENCY, f"the drive is in {state.name}")
         if monitor.left_operational:
-            return Rule.DRIVE_REBOOT, "the drive left the operational state"
+            return Problem(Rule.DRIVE_REBOOT, "the drive left the operational state")
         if machine.problem:
-            return Rule.ONE_FAULT_STOPS_BOTH, f"the drive {machine.problem}"
+            return Problem(Rule.ONE_FAULT_STOPS_BOTH, f"the drive {machine.problem}")
         if homing is not None and homing.problem:
             failed = homing.step is HomingStep.FAILED
             rule = Rule.ONE_FAULT_STOPS_BOTH if failed else Rule.HOMING_TIME
-            return rule, f"the drive {homing.problem}"
+            return Problem(rule, f"the drive {homing.problem}")
         if machine.ready and machine.at.statusword & FOLLOWING_ERROR:
-            return Rule.FOLLOWING_ERROR, "the drive reports a following error"
+            return Problem(Rule.FOLLOWING_ERROR, "the drive reports a following error")
         return None
 
     # ---- set-up, reset, shut-down -------------------------------------------------------------

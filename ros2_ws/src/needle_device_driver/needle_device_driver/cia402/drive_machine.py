@@ -30,7 +30,7 @@ _WINDOW = 5
 _MAX_STOP_DELAY = 25
 # A change of state that takes longer has failed.
 _MAX_SWITCHING = 100
-# A drive that does not leave its quick stop in this time is switched off and on again.
+# A drive that does not leave its quick stop in this time at rest is switched off and on again.
 _MAX_REENABLE = 10
 
 
@@ -215,8 +215,7 @@ class DriveMachine:
         if (
             self._goal is Goal.ON
             and state is DriveState.QUICK_STOP_ACTIVE
-            and self._cycles > _MAX_REENABLE + _REST
-            and self._still_cycles > _REST
+            and min(self._cycles, self._still_cycles) > _MAX_REENABLE
         ):
             # Transition 16 is optional: without it, go through SWITCH ON DISABLED.
             self._switched_off_temporarily = True

@@ -18,7 +18,6 @@ from needle_device_driver.link.objects import (
     STATUS,
     Pdo,
 )
-from needle_device_driver.procedure import Procedure, Wait
 
 _ANSWER = (STATUS.function_code, POSITION.function_code)
 # One answer may be lost. If more are missing, the next one may answer a much earlier SYNC.
@@ -92,6 +91,8 @@ class DriveMonitor:
         The newest process data.
     heartbeats : int
         Number of heartbeats since the last set-up began.
+    nmt_state : int
+        Last NMT state in a heartbeat.
     rebooted : bool
         Whether the node sent a boot-up message since the last set-up.
     emergency : int or None
@@ -105,7 +106,7 @@ class DriveMonitor:
         self._received = dict.fromkeys(_ANSWER, 0)
         self._fresh_time = -math.inf
         self._heartbeat_time = -math.inf
-        self._nmt_state = NMT_BOOT_UP
+        self.nmt_state = NMT_BOOT_UP
         self._is_set_up = False
         self._outdated = False
         self.feedback = Feedback()
@@ -123,14 +124,14 @@ class DriveMonitor:
     @property
     def fresh_since(self) -> float:
         """Steady time from which the age of the feedback counts [s]."""
-        if self._is_waiting or self._nmt_state != NMT_OPERATIONAL:
+        if self._is_waiting or self.nmt_state != NMT_OPERATIONAL:
             return self._fresh_time
         return max(self._fresh_time, self._heartbeat_time)
 
     @property
     def left_operational(self) -> bool:
         """Whether the node's heartbeat reports another NMT state than operational."""
-        return self._is_set_up and self._nmt_state != NMT_OPERATIONAL
+        return self._is_set_up and self.nmt_state != NMT_OPERATIONAL
 
     def answered(self) -> bool:
         """Return whether the answer to the last SYNC is complete and not late."""
@@ -184,11 +185,6 @@ class DriveMonitor:
             number, statusword, mode, inputs, position, syncs=self._all_syncs, time=now
         )
 
-    def await_operational(self, before: int, timeout: float) -> Procedure[bool]:
-        """Wait for more than `before` heartbeats; return whether the last reports operational."""
-        yield Wait(lambda: self.heartbeats > before, timeout)
-        return self.heartbeats > before and self._nmt_state == NMT_OPERATIONAL
-
     @property
     def _is_waiting(self) -> bool:
         return len(self._answers) < len(_ANSWER) or self._is_behind
@@ -228,8 +224,8 @@ class DriveMonitor:
         self.heartbeats += 1
         self._heartbeat_time = time
         # The upper bit toggles in the older protocol, node guarding.
-        self._nmt_state = state & 0x7F
-        if self._nmt_state == NMT_BOOT_UP:
+        self.nmt_state = state & 0x7F
+        if self.nmt_state == NMT_BOOT_UP:
             self.rebooted = True
 
     def _on_emergency(self, data: bytes, _: float) -> None:

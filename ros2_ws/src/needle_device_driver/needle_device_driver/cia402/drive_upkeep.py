@@ -13,7 +13,7 @@ from needle_device_driver.link.error_codes import describe_error
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutError
-from needle_device_driver.procedure import Procedure
+from needle_device_driver.procedure import Procedure, Wait
 
 # Time-outs [s].
 _HEARTBEAT_TIMEOUT = 0.3
@@ -64,7 +64,8 @@ def await_operational(
         # Count first: the drive may answer at once.
         before = monitor.heartbeats
         link.beat()
-        if (yield from monitor.await_operational(before, period)):
+        yield Wait(lambda: monitor.heartbeats > before, period)  # noqa: B023 - runs in this pass
+        if monitor.heartbeats > before and monitor.nmt_state == od.NMT_OPERATIONAL:
             return True
     return False
 

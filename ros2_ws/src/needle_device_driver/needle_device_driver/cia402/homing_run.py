@@ -78,8 +78,6 @@ class HomingRun:
                 self._reports_previous = attained
                 self.step = HomingStep.RUNNING
             return
-        if self.step is not HomingStep.RUNNING:
-            return
         if at.statusword & HOMING_ERROR:
             self.step = HomingStep.FAILED
             self.problem = "reports that homing failed"

@@ -8,7 +8,7 @@ from needle_device_driver.axes.link import DriveError
 from needle_device_driver.link.error_codes import NO_SUCH_OBJECT, WRONG_LENGTH
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import Entry
-from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutError
+from needle_device_driver.link.sdo_client import SdoAbortedError, SdoClient, SdoTimeoutError
 from needle_device_driver.procedure import Procedure
 
 
@@ -79,7 +79,7 @@ class ObjectAccess:
             If the link is lost.
         """
         try:
-            data = yield from self._upload(entry)
+            data = yield from self._begin().upload(entry.index, entry.subindex)
             narrower = entry.resized(len(data)) if len(data) < entry.size else None
             return (narrower or entry).unpack(data)
         except (SdoAbortedError, SdoTimeoutError, ValueError) as error:
@@ -100,7 +100,7 @@ class ObjectAccess:
         that is, gets other values later.
         """
         try:
-            yield from self._download(entry, entry.pack(value))
+            yield from self._begin().download(entry.index, entry.subindex, entry.pack(value))
         except SdoAbortedError as error:
             if error.code in WRONG_LENGTH and (yield from self._write_resized(entry, value)):
                 return
@@ -148,22 +148,19 @@ class ObjectAccess:
         with contextlib.suppress(DriveRefusalError):
             yield from self.write(entry, value)
 
-    def _upload(self, entry: Entry) -> Procedure[bytes]:
+    def _begin(self) -> SdoClient:
+        """Send the computer's heartbeat before a transfer; return the node's client."""
         self._link.beat()
-        client = self._link.sdo_client(self._node_id)
-        return (yield from client.upload(entry.index, entry.subindex))
-
-    def _download(self, entry: Entry, data: bytes) -> Procedure[None]:
-        self._link.beat()
-        client = self._link.sdo_client(self._node_id)
-        yield from client.download(entry.index, entry.subindex, data)
+        return self._link.sdo_client(self._node_id)
 
     def _write_resized(self, entry: Entry, value: int) -> Procedure[bool]:
         try:
-            resized = entry.resized(len((yield from self._upload(entry))))
+            data = yield from self._begin().upload(entry.index, entry.subindex)
+            resized = entry.resized(len(data))
             if resized is None:
                 return False
-            yield from self._download(resized, resized.pack(value))
+            data = resized.pack(value)
+            yield from self._begin().download(entry.index, entry.subindex, data)
         except (SdoAbortedError, SdoTimeoutError):
             return False
         return True

@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 from needle_device_driver.axes.axis import PERIOD, AxisSnapshot
 from needle_device_driver.axes.axis_settings import PRESENT_POSITION_METHODS, AxisSettings
-from needle_device_driver.axes.drives import CyclicAxis, Fault
+from needle_device_driver.axes.drives import CyclicAxis
 from needle_device_driver.axes.link import DriveError, raised_as_axis_error
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
 from needle_device_driver.procedure import Procedure, Wait
-from needle_device_driver.rules import Rule
+from needle_device_driver.rules import Problem, Rule
 
 # An axis is at rest after this number of cycles without motion.
 _REST = 3
@@ -73,7 +73,7 @@ class PolledAxis(CyclicAxis):
         self._set_point_speed: int | None = None
         self._homing_speed = self._travelled = 0.0
         self._still = self._cycles = self._order_cycles = 0
-        self._problem: Fault | None = None
+        self._problem: Problem | None = None
         self.answered = True
 
     # ---- orders -------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ class PolledAxis(CyclicAxis):
 
     def start_move(self, target: float, speed: float) -> None:
         """Set the set-point of the next cycle; it implies the speed."""
-        counts = self._check_move(target, speed, self._target, ready=self._ready)
+        counts = self._check_move(target, speed, self._target)
         if counts != self._target:
             # A repeated set-point would replace the drive's unfinished order with a slower one.
             step = abs(counts - self._target)
@@ -227,10 +227,8 @@ class PolledAxis(CyclicAxis):
         return self._ready_for_orders and self._homing is None
 
     @property
-    def _fault(self) -> Fault | None:
+    def _fault(self) -> Problem | None:
         at = self._at
-        if not self._configured:
-            return None
         for rule, text in (
             (Rule.LINK_LOSS, self._link.lost),
             (Rule.DRIVE_REBOOT, "the drive restarted; its home is lost" if at.rebooted else ""),
@@ -240,7 +238,7 @@ class PolledAxis(CyclicAxis):
             (Rule.AXIS_SPEED, self._speed.problem),
         ):
             if text:
-                return rule, text
+                return Problem(rule, text)
         return self._problem
 
     def _move_to(self, target: int, speed: float) -> None:
@@ -268,7 +266,7 @@ class PolledAxis(CyclicAxis):
         try:
             yield from self._protocol.write_limits(self.name, lower, upper)
         except DriveError as error:
-            self._problem = Rule.ONE_FAULT_STOPS_BOTH, str(error)
+            self._problem = Problem(Rule.ONE_FAULT_STOPS_BOTH, str(error))
             return
         self._limits_due = False
 
@@ -284,7 +282,7 @@ class PolledAxis(CyclicAxis):
         elif self._homing is _Homing.LEAVE and not at.home_switch:
             self._count_from_home(at.position)
         elif self._travelled > settings.longest_search:
-            self._problem = (
+            self._problem = Problem(
                 Rule.HOMING_TIME,
                 f"moved {settings.text(self._travelled)} without finding home, limit "
                 f"{settings.text(settings.longest_search)}",
@@ -327,7 +325,7 @@ class PolledAxis(CyclicAxis):
             )
 
     def _set_problem(self, rule: Rule, text: str) -> None:
-        self._problem = self._problem or (rule, text)
+        self._problem = self._problem or Problem(rule, text)
 
     @property
     def _stop_failure(self) -> str:

@@ -15,7 +15,7 @@ from needle_core.diagnostics import sanitize_list
 from needle_core.messages import INSERTION_JOINT, ROTATION_JOINT, Trajectory
 from needle_device_driver.axes.axis import PairSnapshot
 from needle_device_driver.axes.motion import Leg
-from needle_device_driver.rules import Rule
+from needle_device_driver.rules import Problem, Rule
 from needle_device_driver.supervisor.command_stamps import CommandStamps
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold
@@ -55,14 +55,6 @@ class CommandContext:
     publishers: int
 
 
-@dataclasses.dataclass(frozen=True)
-class Refusal:
-    """The rule that a command breaks, and how, with value and bound."""
-
-    rule: Rule
-    reason: str
-
-
 def is_path(command: Trajectory) -> bool:
     """Return whether a command may replace a path under way."""
     return len(command.points) > 1
@@ -70,7 +62,7 @@ def is_path(command: Trajectory) -> bool:
 
 def check_command(
     command: Trajectory, context: CommandContext, limits: SafetyLimits
-) -> tuple[Leg, ...] | Refusal:
+) -> tuple[Leg, ...] | Problem:
     """Return the legs of a command, or the first rule that it breaks.
 
     Parameters
@@ -84,22 +76,22 @@ def check_command(
 
     Returns
     -------
-    tuple of Leg, or Refusal
+    tuple of Leg, or Problem
         For a path, only the legs ahead of the last set-points; empty if these are at its end.
     """
     if context.publishers > 1:
-        return Refusal(
+        return Problem(
             Rule.COMMAND_ONE_PUBLISHER, f"{context.publishers} nodes publish commands, expected 1"
         )
     refusal = check_form(command) or _check_age(context, limits)
     if refusal is not None:
         return refusal
     if not context.homed:
-        return Refusal(Rule.HOMED_FIRST, "the axes are not homed")
+        return Problem(Rule.HOMED_FIRST, "the axes are not homed")
     path = _path(command, context)
     begin = path[0].start[0]
     if begin > context.insertion + limits.insertion_tolerance * _ROUNDING:
-        return Refusal(
+        return Problem(
             Rule.COMMAND_FORM,
             f"the path begins at {begin * 1e3:.6g} mm, ahead of the needle at "
             f"{context.insertion * 1e3:.6g} mm",
@@ -110,47 +102,47 @@ def check_command(
     return _check_bounds(path, context, limits) or _legs_ahead(path, context.insertion)
 
 
-def check_form(command: Trajectory) -> Refusal | None:
+def check_form(command: Trajectory) -> Problem | None:
     """Return the rule that a command breaks in every state of the device."""
     names, points = command.joint_names, command.points
     if set(names) != {INSERTION_JOINT, ROTATION_JOINT} or len(names) != 2:
-        return Refusal(
+        return Problem(
             Rule.COMMAND_FORM,
             f"joints {sanitize_list(names)}, expected {INSERTION_JOINT}, {ROTATION_JOINT}",
         )
     if not 0 < len(points) <= MAX_POINTS:
-        return Refusal(Rule.COMMAND_FORM, f"{len(points)} points, expected 1 to {MAX_POINTS}")
+        return Problem(Rule.COMMAND_FORM, f"{len(points)} points, expected 1 to {MAX_POINTS}")
     for point in points:
         if len(point.positions) != len(names):
-            return Refusal(Rule.COMMAND_FORM, f"{len(point.positions)} positions, expected 2")
+            return Problem(Rule.COMMAND_FORM, f"{len(point.positions)} positions, expected 2")
         if not all(map(math.isfinite, (*point.positions, *point.others, point.time_from_start))):
-            return Refusal(Rule.COMMAND_FINITE, "a number is not finite")
+            return Problem(Rule.COMMAND_FINITE, "a number is not finite")
     return _check_times(command)
 
 
-def _check_times(command: Trajectory) -> Refusal | None:
+def _check_times(command: Trajectory) -> Problem | None:
     times = [point.time_from_start for point in command.points]
-    earliest = 0.0 if is_path(command) else math.nextafter(0.0, 1.0)
-    if not earliest <= times[0] or not times[-1] <= HARD_STEP_TIME_CAP:
-        wrong = times[0] if times[0] < earliest else times[-1]
-        return Refusal(
+    begins = times[0] >= 0.0 if is_path(command) else times[0] > 0.0
+    if not begins or times[-1] > HARD_STEP_TIME_CAP:
+        wrong = times[-1] if begins else times[0]
+        return Problem(
             Rule.COMMAND_FORM,
             f"time_from_start {wrong:g} s, expected > 0 s and at most {HARD_STEP_TIME_CAP:g} s",
         )
     if any(after <= before for before, after in itertools.pairwise(times)):
-        return Refusal(Rule.COMMAND_FORM, "time_from_start does not increase from point to point")
+        return Problem(Rule.COMMAND_FORM, "time_from_start does not increase from point to point")
     return None
 
 
-def _check_age(context: CommandContext, limits: SafetyLimits) -> Refusal | None:
+def _check_age(context: CommandContext, limits: SafetyLimits) -> Problem | None:
     if context.not_new:
-        return Refusal(Rule.COMMAND_NEWER, context.not_new)
+        return Problem(Rule.COMMAND_NEWER, context.not_new)
     if context.tip_age < 0.0:
-        return Refusal(
+        return Problem(
             Rule.TIP_AGE, f"the tip is from the future: {describe_lead(context.tip_age)}"
         )
     if context.tip_age > limits.tip_age_limit:
-        return Refusal(
+        return Problem(
             Rule.TIP_AGE,
             f"the tip is {context.tip_age:.3f} s old, limit {limits.tip_age_limit:g} s",
         )
@@ -202,17 +194,17 @@ def _legs_ahead(path: list[_Piece], insertion: float) -> tuple[Leg, ...]:
 
 def _check_bounds(
     path: list[_Piece], context: CommandContext, limits: SafetyLimits
-) -> Refusal | None:
+) -> Problem | None:
     end = path[-1].leg.insertion
     length = end - context.insertion
     if length <= 0.0:
-        return Refusal(
+        return Problem(
             Rule.FORWARD_ONLY,
             f"insertion {end * 1e3:.4g} mm is not ahead of {context.insertion * 1e3:.4g} mm",
         )
     back = next((piece for piece in path if piece.length <= 0.0), None)
     if back is not None:
-        return Refusal(
+        return Problem(
             Rule.FORWARD_ONLY,
             f"insertion {back.leg.insertion * 1e3:.4g} mm is not ahead of the point before, "
             f"{back.start[0] * 1e3:.4g} mm",
@@ -234,7 +226,7 @@ def _check_bounds(
         (Rule.MAX_TURNS, "accumulated rotation", turns, limits.max_turns, 0.0, "turns"),
     ):
         if value > (bound + tolerance) * _ROUNDING:
-            return Refusal(rule, f"{name} {value:.6g} {unit} is beyond {bound:.6g} {unit}")
+            return Problem(rule, f"{name} {value:.6g} {unit} is beyond {bound:.6g} {unit}")
     return None
 
 
@@ -265,7 +257,7 @@ class CommandHandler:
         self._hold = hold
         self._limits = limits
         self._on_path = False
-        self.stamps = CommandStamps(2.0 * limits.tip_age_limit)
+        self.stamps = CommandStamps()
         self.refused = 0
         self.newest_ns = 0
 
@@ -273,7 +265,7 @@ class CommandHandler:
         """Handle an unchecked command; return whether it starts a motion."""
         self.newest_ns = command.stamp_ns
         legs = self._check(command, now, publishers)
-        if isinstance(legs, Refusal):
+        if isinstance(legs, Problem):
             self._refuse(command, legs)
             return False
         self.stamps.accept(command.stamp_ns)
@@ -302,9 +294,9 @@ class CommandHandler:
             self._core.notice(text, Rule.TIP_AGE)
             self._core.abort(text)
 
-    def _check(self, command: Trajectory, now: float, publishers: int) -> tuple[Leg, ...] | Refusal:
+    def _check(self, command: Trajectory, now: float, publishers: int) -> tuple[Leg, ...] | Problem:
         at = self._check_device(command, now)
-        if isinstance(at, Refusal):
+        if isinstance(at, Problem):
             return at
         context = CommandContext(
             insertion=at.insertion.set_point,
@@ -316,28 +308,28 @@ class CommandHandler:
         )
         return check_command(command, context, self._limits)
 
-    def _check_device(self, command: Trajectory, now: float) -> PairSnapshot | Refusal:
+    def _check_device(self, command: Trajectory, now: float) -> PairSnapshot | Problem:
         replaces = is_path(command) and self._on_path and self._core.activity is Activity.STEP
         if self._core.state is not State.HOLDING and not replaces:
             state = self._core.state.value
-            return Refusal(Rule.COMMAND_STATE, f"the device is {state}, not {State.HOLDING.value}")
+            return Problem(Rule.COMMAND_STATE, f"the device is {state}, not {State.HOLDING.value}")
         if self._hold.owner is None:
-            return Refusal(Rule.HOLD_TO_RUN, "the hold is not pressed")
+            return Problem(Rule.HOLD_TO_RUN, "the hold is not pressed")
         # Read the axes again: one may have stopped since the last cycle.
         at = self._core.poll(now)
         if at.age(now) > self._limits.reply_age_limit:
-            return Refusal(Rule.REPLY_AGE, "no fresh reply from the axes")
+            return Problem(Rule.REPLY_AGE, "no fresh reply from the axes")
         if not at.powered:
-            return Refusal(Rule.COMMAND_STATE, "the axes are not powered yet")
+            return Problem(Rule.COMMAND_STATE, "the axes are not powered yet")
         if at.insertion.at_inner_switch:
-            return Refusal(Rule.INNER_LIMIT_SWITCH, f"{INNER_SWITCH}: retract")
+            return Problem(Rule.INNER_LIMIT_SWITCH, f"{INNER_SWITCH}: retract")
         return at
 
-    def _refuse(self, command: Trajectory, refusal: Refusal) -> None:
+    def _refuse(self, command: Trajectory, refusal: Problem) -> None:
         self.refused += 1
         if refusal.rule is Rule.TIP_AGE:
             self._core.watchdog_trips += 1
-        self._core.explain(f"command refused: {refusal.reason}", refusal.rule)
+        self._core.explain(f"command refused: {refusal.text}", refusal.rule)
         # A result with the stamp of the running step would mean that the step has ended.
         if command.stamp_ns != self._core.step_stamp_ns:
-            self._core.report_result(command.stamp_ns, f"aborted: {refusal.reason}")
+            self._core.report_result(command.stamp_ns, f"aborted: {refusal.text}")

@@ -8,6 +8,8 @@ from collections import deque
 
 # Tolerated lead of a sender's clock over the noted ROS time, for example due to latency [ns].
 _MAX_LEAD_NS = 100_000_000
+# Two minutes of cycles, twice the largest `tip_age_limit`.
+_MAX_NOTES = 6000
 # Exceeds the number of steps of an insertion.
 _MAX_REMEMBERED = 2000
 
@@ -18,17 +20,13 @@ class CommandStamps:
     ROS time may be simulated, stepped or paused: ages in it would make every tip look old, or an
     old tip look fresh. So the class notes pairs of ROS time and steady time.
 
-    Parameters
-    ----------
-    horizon : float
-        Time for which notes are kept [s]; greater ages are infinite.
+    An age beyond the oldest note is infinite.
     """
 
-    def __init__(self, horizon: float) -> None:
-        self._horizon = horizon
+    def __init__(self) -> None:
         # Noted ROS times, and the steady time at which each was last observed.
-        self._ros_ns: list[int] = []
-        self._observed: list[float] = []
+        self._ros_ns: deque[int] = deque(maxlen=_MAX_NOTES)
+        self._observed: deque[float] = deque(maxlen=_MAX_NOTES)
         self._last_ns: int | None = None
         self._used_ns: deque[int] = deque(maxlen=_MAX_REMEMBERED)
 
@@ -43,11 +41,6 @@ class CommandStamps:
             return
         self._ros_ns.append(ros_ns)
         self._observed.append(now)
-        old = bisect.bisect_left(self._observed, now - self._horizon)
-        # Deleting costs time in proportion to the length of the list: do it rarely.
-        if old > 1000:
-            del self._ros_ns[: old - 1]
-            del self._observed[: old - 1]
 
     def age(self, stamp_ns: int, now: float) -> float:
         """Return an upper bound on the time since `stamp_ns` was the ROS time [s].

@@ -91,9 +91,8 @@ class DeviceCore:
 
     @property
     def retraction_distance(self) -> float:
-        """Longest allowed retraction [m]; 0 without a snapshot."""
-        if self.snapshot is None:
-            return 0.0
+        """Longest allowed retraction [m]."""
+        assert self.snapshot is not None
         insertion = self.snapshot.insertion
         return insertion.position - self._retraction_bound.target(insertion)
 
@@ -170,19 +169,17 @@ class DeviceCore:
         self.change_state(Trigger.CONFIGURE, "configured")
         return ""
 
-    def deconfigure(self) -> Procedure[bool]:
-        """Switch the axes off and release them; return whether the state was DISABLED."""
+    def deconfigure(self) -> Procedure[None]:
+        """Switch the axes off and release them."""
         if self.configured:
             self.configured = False
             try:
                 yield from self._axes.close()
             except AxisError as error:
                 self.fail(str(error), error.rule)
-        if self.state is not State.DISABLED:
-            return False
-        self.snapshot = None
-        self.change_state(Trigger.DECONFIGURE, "deconfigured")
-        return True
+        if self.state is State.DISABLED:
+            self.snapshot = None
+            self.change_state(Trigger.DECONFIGURE, "deconfigured")
 
     def reset(self, now: float) -> Procedure[str]:
         """Leave FAULT or ESTOPPED with the axes off; return the remaining problem."""
@@ -197,7 +194,7 @@ class DeviceCore:
                 self.poll(now), now, self._limits, require_power=False, require_home=False
             )
             if problem is not None:
-                return problem[1]
+                return problem.text
             trigger, reason = Trigger.RESET, "reset; enable to continue"
         self._fault = self._stop_failures = ""
         self.change_state(trigger, reason)
@@ -317,8 +314,7 @@ class DeviceCore:
 
     def drive(self, period: float, speed_scale: float, now: float) -> None:
         """Order the set-points of the next `period` [s] of the motion under way."""
-        if self._run is None:
-            return
+        assert self._run is not None
         at = self.poll(now)
         if not at.answered:
             # A missing answer may mean a lost set-point: do not send another. An axis that stays
@@ -326,7 +322,7 @@ class DeviceCore:
             return
         problem = self._run.problem(at)
         if problem is not None:
-            self.fail(problem[1], problem[0])
+            self.fail(problem.text, problem.rule)
             return
         set_point = self._run.advance(at, period, speed_scale)
         if set_point is None:
@@ -368,8 +364,8 @@ class DeviceCore:
             text = "blocked when it was stopped; switched off until the next motion"
             self.explain(f"{at.released_after_block}: {text}", Rule.FOLLOWING_ERROR)
         if problem is not None:
-            self.watchdog_trips += problem[0] is Rule.REPLY_AGE
-            self.fail(problem[1], problem[0])
+            self.watchdog_trips += problem.rule is Rule.REPLY_AGE
+            self.fail(problem.text, problem.rule)
 
     def _check_stopped(self, at: PairSnapshot, now: float) -> None:
         # In FAULT, silence may be the fault itself.
@@ -381,8 +377,7 @@ class DeviceCore:
     def finish_completed_motion(self) -> None:
         """End a homing, step or retraction that has arrived."""
         at = self.snapshot
-        if at is None:
-            return
+        assert at is not None
         if self.activity is Activity.HOMING:
             if at.homed and not (at.insertion.moving or at.rotation.moving):
                 self._end_motion("", stop=False)

@@ -6,8 +6,7 @@ import dataclasses
 import math
 from typing import Any
 
-from needle_core.settings.bounds import ABOVE_0, check_bounds
-from needle_core.settings.parameter_fields import fixed_parameter, specs
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 
 # Caps for every configuration: properties of the rig.
 HARD_SPEED_CAP = 0.005
@@ -110,10 +109,9 @@ class SafetyLimits:
         Raises
         ------
         UserError
-            If a limit is not finite, not positive, or above the bound of its parameter.
+            If a limit is not finite, or outside the bounds of its parameter.
         """
-        for name, spec, _ in specs(SafetyLimits):
-            check_bounds(name, getattr(self, name), ABOVE_0, spec.upper, spec.unit)
+        check_fields(self)
 
     @classmethod
     def of(cls, parameters: Any) -> SafetyLimits:

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 
 from needle_device_driver.axes.axis import AxisSnapshot, PairSnapshot
 from needle_device_driver.axes.motion import CoordinatedMotion, Leg, SetPoint, slowed_legs
-from needle_device_driver.rules import Rule
+from needle_device_driver.rules import Problem, Rule
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.states import Activity
-
-Problem = tuple[Rule, str]
 
 INNER_SWITCH = "the insertion axis is at its inner limit switch"
 # Weight of the time at the switch: a drive leaves it at a quarter of the homing speed.
@@ -23,16 +21,16 @@ def axes_problem(
 ) -> Problem | None:
     """Return the rule that the axes break, and how."""
     if at.fault:
-        return at.fault_rule, at.fault
+        return Problem(at.fault_rule, at.fault)
     if at.age(now) > limits.reply_age_limit:
-        return (
+        return Problem(
             Rule.REPLY_AGE,
             f"no reply from an axis for {at.age(now):.3f} s, limit {limits.reply_age_limit:g} s",
         )
     if require_power and not at.powered:
-        return Rule.ONE_FAULT_STOPS_BOTH, "an axis lost its power"
+        return Problem(Rule.ONE_FAULT_STOPS_BOTH, "an axis lost its power")
     if require_home and not at.homed:
-        return Rule.ONE_FAULT_STOPS_BOTH, "an axis lost its home position"
+        return Problem(Rule.ONE_FAULT_STOPS_BOTH, "an axis lost its home position")
     return None
 
 
@@ -107,10 +105,10 @@ class MotionRun:
         """Return the rule that the motion breaks, and how."""
         limits = self._limits
         if self.activity is Activity.STEP and at.insertion.at_inner_switch:
-            return Rule.INNER_LIMIT_SWITCH, INNER_SWITCH
+            return Problem(Rule.INNER_LIMIT_SWITCH, INNER_SWITCH)
         if self._settling > limits.settling_time:
             insertion, rotation = self._distance_to_end(at)
-            return (
+            return Problem(
                 Rule.SETTLING_TIME,
                 f"the axes are not at their target {limits.settling_time:g} s after the last "
                 f"set-point: insertion {insertion * 1e3:.4f} mm, rotation {rotation:.5f} rad off",
@@ -120,14 +118,14 @@ class MotionRun:
         due = self._due[0]
         insertion = abs(due.insertion - at.insertion.position)
         if not self._pushed and insertion > limits.insertion_following_error:
-            return (
+            return Problem(
                 Rule.FOLLOWING_ERROR,
                 f"the insertion axis is {insertion * 1e3:.3f} mm off its set-point, "
                 f"limit {limits.insertion_following_error * 1e3:g} mm",
             )
         rotation = abs(due.rotation - at.rotation.position)
         if self.activity is Activity.STEP and rotation > limits.rotation_following_error:
-            return (
+            return Problem(
                 Rule.FOLLOWING_ERROR,
                 f"the rotation axis is {rotation:.3f} rad off its set-point, "
                 f"limit {limits.rotation_following_error:g} rad",
@@ -150,16 +148,11 @@ class MotionRun:
         # Start at the last set-point: a motor may rest beside it, and a path from the measured
         # position could begin with a jump of the set-point.
         start = at.insertion.set_point, at.rotation.set_point
-        if self.activity is Activity.RETRACTION:
-            legs = slowed_legs(start, self._legs, max_speed=self._limits.retraction_speed)
-        else:
-            legs = slowed_legs(
-                start,
-                self._legs,
-                max_speed=self._limits.max_speed,
-                max_rotation_rate=self._limits.max_rotation_rate,
-            )
-        return CoordinatedMotion(start, legs)
+        retracts, limits = self.activity is Activity.RETRACTION, self._limits
+        speed = limits.retraction_speed if retracts else limits.max_speed
+        return CoordinatedMotion(
+            start, slowed_legs(start, self._legs, speed, limits.max_rotation_rate)
+        )
 
     def _distance_to_end(self, at: PairSnapshot) -> tuple[float, float]:
         end = self._legs[-1]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from needle_core.diagnostics import Level, sanitize
 from needle_core.messages import HoldState, Trajectory
 from needle_core.status_messages import DeviceStatus
@@ -36,8 +34,11 @@ class MotionSupervisor:
         The bounds of the rules.
     feedback_delay : int
         Number of cycles until a set-point shows in the feedback.
-    is_switching : callable, optional
-        Returns whether an axis still executes an order other than a set-point.
+
+    Attributes
+    ----------
+    conflict : str
+        Another device on the same topics; empty: there is none.
     """
 
     def __init__(
@@ -47,16 +48,14 @@ class MotionSupervisor:
         limits: SafetyLimits,
         *,
         feedback_delay: int = 0,
-        is_switching: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._is_switching = is_switching
         self._axes = AxisPair(insertion, rotation)
         self._limits = limits
         self._hold = Hold(limits.hold_timeout)
         self._hold_notices = HoldNotices()
         self._estop_pressed = False
         self._needle_out = False
-        self._conflict = ""
+        self.conflict = ""
         self._core = DeviceCore(
             self._axes,
             limits,
@@ -91,15 +90,12 @@ class MotionSupervisor:
         at = self._core.snapshot
         return None if at is None or at.age(now) > self._limits.reply_age_limit else at
 
-    def is_held(self, now: float) -> bool:
-        """Return whether the owner's press is fresh and its speed is above 0."""
-        return self._hold.is_fresh(now) and self._hold.speed_scale > 0.0
-
     def may_move(self, now: float) -> bool:
         """Return whether `drive` would continue the motion under way."""
         if self._core.activity is Activity.HOMING:
             return True
-        return self._core.activity is not Activity.NONE and self.is_held(now)
+        is_held = self._hold.is_fresh(now) and self._hold.speed_scale > 0.0
+        return self._core.activity is not Activity.NONE and is_held
 
     def status(
         self, now: float, source: str = "", *, simulated: bool | None = None
@@ -140,13 +136,11 @@ class MotionSupervisor:
         self.observe(now)
         return ServiceResult(True, "configured")
 
-    def deconfigure(self) -> Procedure[ServiceResult]:
+    def deconfigure(self) -> Procedure[None]:
         """Stop, switch the axes off and release them; a fault or emergency stop remains."""
         if self._core.state in (State.HOLDING, State.MOVING):
             self._disable()
-        if not (yield from self._core.deconfigure()):
-            return ServiceResult(False, f"the device is {self._core.state.value}")
-        return ServiceResult(True, "deconfigured")
+        yield from self._core.deconfigure()
 
     def note_time(self, ros_ns: int, now: float) -> None:
         """Note that ROS time is `ros_ns` [ns]; call it in each cycle."""
@@ -172,9 +166,9 @@ class MotionSupervisor:
 
     def report_conflicting_device(self, conflict: str) -> None:
         """Fail if another device uses the same topics; an empty text means there is none."""
-        if conflict == self._conflict:
+        if conflict == self.conflict:
             return
-        self._conflict = conflict
+        self.conflict = conflict
         if conflict:
             # The confirmation may have been meant for the other device.
             self._needle_out = False
@@ -212,7 +206,7 @@ class MotionSupervisor:
             return ServiceResult(True, "already enabled")
         if self._core.state is not State.DISABLED:
             return self._wrong_state(State.DISABLED)
-        if self._is_switching():
+        if self._axes.needs_cycles:
             return ServiceResult(False, _SWITCHING)
         if error := self._core.power_on():
             return ServiceResult(False, error)
@@ -226,8 +220,8 @@ class MotionSupervisor:
         """Record a person's confirmation that the needle is out; the next step cancels it."""
         if self._core.activity is not Activity.NONE:
             return ServiceResult(False, f"a {self._core.activity.value} is under way")
-        if confirmed and self._conflict:
-            return ServiceResult(False, self._conflict)
+        if confirmed and self.conflict:
+            return ServiceResult(False, self.conflict)
         self._needle_out = confirmed
         return ServiceResult(True, "needle out" if confirmed else "needle not out")
 
@@ -237,7 +231,7 @@ class MotionSupervisor:
             return self._wrong_state(State.DISABLED)
         if not self._needle_out:
             return ServiceResult(False, "confirm first that the needle is out (confirm_needle_out)")
-        if self._is_switching():
+        if self._axes.needs_cycles:
             return ServiceResult(False, _SWITCHING)
         if error := (yield from self._core.start_homing()):
             return ServiceResult(False, error)
@@ -287,8 +281,8 @@ class MotionSupervisor:
         self._commands.stamps.clear_rejections()
         if self._core.state not in (State.FAULT, State.ESTOPPED):
             return ServiceResult(True, "nothing to reset")
-        if self._conflict:
-            return ServiceResult(False, self._conflict)
+        if self.conflict:
+            return ServiceResult(False, self.conflict)
         if self._estop_pressed:
             return ServiceResult(False, "the emergency stop is still pressed")
         if not self._hold.is_off(now):

@@ -19,7 +19,6 @@ def test_last_set_point_is_exactly_the_target(
     start: tuple[float, float], end: tuple[float, float], duration: float
 ) -> None:
     motion = CoordinatedMotion(start, [Leg(*end, duration)])
-    set_point = motion.advance(0.0, 1.0)
     while not motion.complete:
         set_point = motion.advance(0.02, 1.0)
     assert (set_point.insertion, set_point.rotation) == end

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
@@ -11,12 +11,12 @@ import pytest
 from needle_core.errors import UserError
 from needle_device_driver.axes.link import DriveError
 from needle_device_driver.backends.zaber import ZaberProtocol
-from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.polled.drive_protocol import DriveReply
-from needle_device_driver.polled.text_link import TextLink
-from needle_device_driver.procedure import Procedure, T, run
 
-AXES = ("insertion", "rotation")
+from .protocol_bench import ProtocolBench
+
+MESSAGE = re.compile(r"/(\d+) (\d) (\d+) ([^:]*):..\n")
+"""Device, axis, number and text of a message."""
 NEW = {
     "get version": "7.38",
     "get system.serial": "0",
@@ -30,67 +30,44 @@ NEW = {
 """Data of a device that has everything, after power-up."""
 
 
-class Line:
-    """A protocol, and the other end of its line: a table from command to data, None: rejected."""
+class Line(ProtocolBench[ZaberProtocol]):
+    """Devices that answer commands from a table, else with 0; None: rejected."""
 
-    def __init__(self, **parameters: Any) -> None:
-        settings = DeviceDriverParameters(
-            insertion_drive="zaber",
-            rotation_drive="zaber",
-            insertion_counts_per_unit=1e6,
-            rotation_counts_per_unit=1000.0,
-            **parameters,
-        )
-        self.link = TextLink("zaber", b"\n")
-        self.link.open()
-        self.protocol = ZaberProtocol(settings, {a: settings.axis(a) for a in AXES}, self.link)
-        self.statuses: list[tuple[int, dict[str, DriveReply]]] = []
-        self.protocol.on_status = lambda number, at: self.statuses.append((number, dict(at)))
-        self.received: list[str] = []
+    def __init__(self, changes: Mapping[str, str | None] | None = None, **parameters: Any) -> None:
+        counts = {"insertion_counts_per_unit": 1e6, "rotation_counts_per_unit": 1000.0}
+        super().__init__(ZaberProtocol, **counts | parameters)
+        self.data: Mapping[str, str | None] = {**NEW, **(changes or {})}
+        self.is_silent = False
+        self.commands: list[str] = []
 
-    def sent(self) -> bytes:
-        return b"".join(self.link.pop_outgoing())
-
-    def receive(self, *texts: str) -> None:
+    def say(self, *texts: str) -> None:
         """Receive replies without their checksum and line end."""
         for text in texts:
-            self.receive_bytes(f"{text}:{-sum(text[1:].encode()) % 256:02X}\r\n".encode())
+            self.receive(f"{text}:{-sum(text[1:].encode()) % 256:02X}\r\n".encode())
 
-    def receive_bytes(self, data: bytes) -> None:
-        for line in self.link.receive((data,)):
-            self.protocol.on_line(line)
+    def reply(self, sent: bytes) -> None:
+        for device, axis, number, command in MESSAGE.findall(sent.decode()):
+            self.commands.append(f"{device} {axis} {command}")
+            answer = self.data.get(command, "0")
+            flag = "OK" if answer is not None else "RJ"
+            if not self.is_silent:
+                text = f"{flag} IDLE WR {answer or 'BADCOMMAND'}"
+                self.say(f"@{device:>02} {axis} {number:>02} {text}")
 
-    def talk(self, procedure: Procedure[T], data: Mapping[str, str | None] | None) -> T:
-        """Run a procedure with a device that answers from a table, else with 0, or not at all."""
-
-        def wait(is_there: Callable[[], bool], seconds: float) -> None:
-            for device, axis, number, command in re.findall(
-                r"/(\d+) (\d) (\d+) ([^:]*):..\n", self.sent().decode()
-            ):
-                self.received.append(f"{device} {axis} {command}")
-                if data is None:
-                    continue
-                answer = data.get(command, "0")
-                flag = "OK" if answer is not None else "RJ"
-                self.receive(
-                    f"@{device:>02} {axis} {number:>02} {flag} IDLE WR {answer or 'BADCOMMAND'}"
-                )
-            self.link.now += 0.0 if is_there() else seconds
-
-        return run(procedure, wait, lambda: self.link.now)
-
-    def ready(self, data: Mapping[str, str | None] = NEW) -> Line:
-        self.talk(self.protocol.identify(), data)
-        for axis in AXES:
-            self.talk(self.protocol.set_up(axis), data)
-        self.received.clear()
+    def ready(self) -> Line:
+        self.run(self.protocol.identify())
+        self.set_up()
+        self.commands.clear()
         return self
 
-    def answer(self, number: int, *, flag: str = "--", status: str = "IDLE") -> None:
-        """Answer a request of both axes: positions 900 and 900, other states 0."""
+    def answered(self, number: int, *, flag: str = "--", status: str = "IDLE") -> DriveReply:
+        """Request, answer positions 900 and else 0; return the state of the rotation axis."""
+        self.protocol.request(number)
         for device in (1, 2):
             for message_id, data in ((1 + number, "900"), (34 + number, "0")):
-                self.receive(f"@{device:02} 1 {message_id:02} OK {status} {flag} {data}")
+                self.say(f"@{device:02} 1 {message_id:02} OK {status} {flag} {data}")
+        assert self.states[-1][0] == number
+        return self.state("rotation")
 
 
 def test_identify_ends_a_partial_line_and_switches_checksums_on() -> None:
@@ -99,47 +76,35 @@ def test_identify_ends_a_partial_line_and_switches_checksums_on() -> None:
     next(procedure)
     assert line.sent() == b"\n/1 0 67 get version:6C\n"
     procedure.close()
-    assert line.talk(line.protocol.identify(), NEW) == (
+    assert line.run(line.protocol.identify()) == (
         "Emulated Zaber, device 1: ID 50952, firmware 7.38, device 2: ID 50952, firmware 7.38"
     )
-    assert "1 0 set comm.checksum 1" in line.received
-    assert "2 0 set comm.checksum 1" in line.received
-    real = {**NEW, "get system.serial": "49822"}
-    assert line.talk(line.protocol.identify(), real).startswith("Zaber, device 1")
+    assert {"1 0 set comm.checksum 1", "2 0 set comm.checksum 1"} <= {*line.commands}
+    real = Line({"get system.serial": "49822"})
+    assert real.run(real.protocol.identify()).startswith("Zaber, device 1")
 
 
 @pytest.mark.parametrize("version", ["7.24", "6.28", "unknown"])
 def test_firmware_without_the_speed_of_a_move_is_refused(version: str) -> None:
-    line = Line()
+    line = Line({"get version": version})
     with pytest.raises(DriveError, match=rf"device 1 has firmware {version}, and 7\.25"):
-        line.talk(line.protocol.identify(), {**NEW, "get version": version})
+        line.run(line.protocol.identify())
 
 
 def test_set_up_of_a_device_after_power_up() -> None:
     line = Line()
-    line.talk(line.protocol.set_up("insertion"), NEW)
+    line.run(line.protocol.set_up("insertion"))
     # 0.5 m/s^2 and 5 mm/s at 1e6 counts/m: values 500000 * 1.6384e-4 and 5000 * 1.6384.
-    assert [text.removeprefix("1 1 ") for text in line.received] == [
-        "driver disable",
-        "set accel 82",
-        "set maxspeed 8192",
-        "set limit.min -1000000000",
-        "set limit.max 1000000000",
-        "set knob.enable 0",
-        "warnings clear",
-        "warnings",
-        "set pos 0",
-        "get limit.home.state",
-        "get limit.away.state",
-        "get encoder.pos",
+    assert [text.removeprefix("1 1 ") for text in line.commands] == [
+        *("driver disable", "set accel 82", "set maxspeed 8192", "set limit.min -1000000000"),
+        *("set limit.max 1000000000", "set knob.enable 0", "warnings clear", "warnings"),
+        *("set pos 0", "get limit.home.state", "get limit.away.state", "get encoder.pos"),
         "get pos",
     ]
-
-
-def test_set_up_keeps_a_position_that_has_a_reference() -> None:
-    line = Line()
-    line.talk(line.protocol.set_up("insertion"), {**NEW, "warnings": "01 WH"})
-    assert "1 1 set pos 0" not in line.received
+    # A position that has a reference is kept.
+    line = Line({"warnings": "01 WH"})
+    line.run(line.protocol.set_up("insertion"))
+    assert "1 1 set pos 0" not in line.commands
 
 
 def test_orders_are_point_moves_with_their_own_speed() -> None:
@@ -153,10 +118,10 @@ def test_orders_are_point_moves_with_their_own_speed() -> None:
         b"/1 1 0 driver enable:FB\n/1 1 0 move abs 1200 16384:F8\n/2 1 0 move abs -5 2:2C\n"
         b"/2 1 0 stop:47\n/1 1 0 driver disable:8E\n"
     )
-    line.talk(line.protocol.write_limits("rotation", -100, 200), {})
-    assert line.received == ["2 1 set limit.min -100", "2 1 set limit.max 200"]
-    line.talk(line.protocol.release("rotation"), {})
-    assert line.received[-1] == "2 1 driver disable"
+    line.run(line.protocol.write_limits("rotation", -100, 200))
+    assert line.commands == ["2 1 set limit.min -100", "2 1 set limit.max 200"]
+    line.run(line.protocol.release("rotation"))
+    assert line.commands[-1] == "2 1 driver disable"
 
 
 def test_the_last_set_points_make_up_for_the_ramps() -> None:
@@ -173,48 +138,35 @@ def test_the_last_set_points_make_up_for_the_ramps() -> None:
 def test_each_request_asks_for_positions_and_one_slow_state() -> None:
     line = Line().ready()
     home, away, warnings = "get limit.home.state", "get limit.away.state", "warnings"
-    for number, insertion, rotation in (
-        (4, [home], []),
-        (5, [away], []),
-        (6, [home], []),
-        (7, [warnings], [warnings]),
-    ):
+    for number, slow, is_of_both in ((4, home, 0), (5, away, 0), (6, home, 0), (7, warnings, 1)):
         line.protocol.request(number)
-        sent = re.findall(r"/(\d) 1 (\d+) (.*):..\n", line.sent().decode())
-        assert sent == [
-            (device, str(message_id), text)
-            for device, slow in (("1", insertion), ("2", rotation))
-            for message_id, text in zip(
-                (1 + number, 34 + number), ["get encoder.pos", *slow], strict=False
-            )
-        ]
+        position, state = (str(1 + number), "get encoder.pos"), (str(34 + number), slow)
+        insertion = [("1", "1", *position), ("1", "1", *state)]
+        rotation = [("2", "1", *position), ("2", "1", *state)][: 1 + is_of_both]
+        assert MESSAGE.findall(line.sent().decode()) == insertion + rotation
 
 
 @pytest.mark.parametrize(("method", "asks"), [(17, True), (37, False)])
 def test_a_rotation_homed_where_it_stands_has_no_switches(method: int, asks: bool) -> None:
     line = Line(rotation_homing_method=method)
-    line.talk(line.protocol.set_up("rotation"), NEW)
-    assert ("2 1 get limit.home.state" in line.received) is asks
+    line.run(line.protocol.set_up("rotation"))
+    assert ("2 1 get limit.home.state" in line.commands) is asks
 
 
 def test_positions_are_measured_by_the_encoder_in_counts_of_the_moves() -> None:
     line = Line().ready()
-    line.protocol.request(5)
-    line.answer(5)
     # After set-up the count was 1000 where the encoder had 900.
-    state = DriveReply(1000, moving=False, powered=True, home_switch=True)
-    rotation = DriveReply(1000, moving=False, powered=True)
-    assert line.statuses == [(5, {"insertion": state, "rotation": rotation})]
+    assert line.answered(5) == DriveReply(1000, moving=False, powered=True)
+    assert line.state() == DriveReply(1000, moving=False, powered=True, home_switch=True)
 
 
 @pytest.mark.parametrize("lack", [None, "NA"])
 def test_a_device_without_encoder_and_sensors_counts_its_steps(lack: str | None) -> None:
     lacks = ("get limit.home.state", "get limit.away.state", "get encoder.pos", "set knob.enable 0")
-    line = Line().ready({**NEW, **dict.fromkeys(lacks, lack)})
-    line.protocol.request(4)
-    assert re.findall(r"\d+ ([a-z].*):", line.sent().decode()) == ["get pos"] * 2
-    line.answer(4)
-    assert line.statuses[0][1]["insertion"] == DriveReply(900, moving=False, powered=True)
+    line = Line(dict.fromkeys(lacks, lack)).ready()
+    line.answered(4)
+    assert [command for *_, command in MESSAGE.findall(line.sent().decode())] == ["get pos"] * 2
+    assert line.state() == DriveReply(900, moving=False, powered=True)
 
 
 @pytest.mark.parametrize(
@@ -231,37 +183,18 @@ def test_a_device_without_encoder_and_sensors_counts_its_steps(lack: str | None)
     ],
 )
 def test_warning_flags(flag: str, status: str, powered: bool, fault: str, rebooted: bool) -> None:
-    line = Line().ready()
-    line.protocol.request(5)
-    line.answer(5, flag=flag, status=status)
-    assert line.statuses[0][1]["rotation"] == DriveReply(
-        1000, status == "BUSY", powered, fault=fault, rebooted=rebooted
-    )
+    at = Line().ready().answered(5, flag=flag, status=status)
+    assert at == DriveReply(1000, status == "BUSY", powered, fault=fault, rebooted=rebooted)
 
 
 def test_a_restart_shows_behind_a_higher_flag() -> None:
     line = Line().ready()
     line.protocol.request(7)
-    line.receive("@01 1 08 OK IDLE WV 900", "@01 1 41 OK IDLE WV 02 WV WR")
-    line.receive("@02 1 08 OK IDLE WV 900", "@02 1 41 OK IDLE WV 01 WV")
-    states = line.statuses[0][1]
-    assert states["insertion"].rebooted
-    assert not states["rotation"].rebooted
-    line.talk(line.protocol.clear_fault("insertion"), {})
-    assert line.received[-1] == "1 1 warnings clear"
-
-
-def test_switches_follow_their_requests() -> None:
-    line = Line().ready()
-    for number, state in ((4, "0"), (5, "1")):
-        line.protocol.request(number)
-        for device in (1, 2):
-            line.receive(
-                f"@0{device} 1 {1 + number:02} OK BUSY -- 900",
-                f"@0{device} 1 {34 + number} OK BUSY -- {state}",
-            )
-    reply = line.statuses[1][1]["insertion"]
-    assert (reply.home_switch, reply.inner_switch) == (False, True)
+    line.say("@01 1 08 OK IDLE WV 900", "@01 1 41 OK IDLE WV 02 WV WR")
+    line.say("@02 1 08 OK IDLE WV 900", "@02 1 41 OK IDLE WV 01 WV")
+    assert (line.state().rebooted, line.state("rotation").rebooted) == (True, False)
+    line.run(line.protocol.clear_fault("insertion"))
+    assert line.commands[-1] == "1 1 warnings clear"
 
 
 COMPLETE = (
@@ -288,34 +221,29 @@ COMPLETE = (
 def test_an_incomplete_or_wrong_answer_is_none(lost: int, instead: bytes) -> None:
     line = Line().ready()
     line.protocol.request(7)
-    line.receive(*(text for index, text in enumerate(COMPLETE) if index != lost))
-    line.receive_bytes(instead)
-    assert line.statuses == []
-    line.receive(COMPLETE[lost])
-    assert len(line.statuses) == 1
+    line.say(*(text for index, text in enumerate(COMPLETE) if index != lost))
+    line.receive(instead)
+    assert line.states == []
+    line.say(COMPLETE[lost])
+    assert len(line.states) == 1
 
 
 def test_a_rejected_order_is_a_fault_until_it_is_acknowledged() -> None:
     line = Line().ready()
-    line.receive("@02 1 00 RJ IDLE -- BADDATA", "@02 1 00 OK BUSY -- 0")
-    line.protocol.request(5)
-    line.answer(5)
-    states = line.statuses[0][1]
-    assert states["rotation"].fault == "refused an order: BADDATA"
-    assert states["insertion"].fault == ""
-    line.talk(line.protocol.clear_fault("rotation"), {})
-    line.protocol.request(6)
-    line.answer(6)
-    assert line.statuses[1][1]["rotation"].fault == ""
+    line.say("@02 1 00 RJ IDLE -- BADDATA", "@02 1 00 OK BUSY -- 0")
+    assert line.answered(5).fault == "refused an order: BADDATA"
+    assert line.state().fault == ""
+    line.run(line.protocol.clear_fault("rotation"))
+    assert line.answered(6).fault == ""
 
 
 def test_a_rejected_setting_and_silence_are_errors() -> None:
-    line = Line()
+    line = Line({"set accel 16": None})
     with pytest.raises(DriveError, match="device 2 refuses 'set accel 16': BADCOMMAND"):
-        line.talk(line.protocol.set_up("rotation"), {**NEW, "set accel 16": None})
-    before = line.link.now
+        line.run(line.protocol.set_up("rotation"))
+    before, line.is_silent = line.link.now, True
     with pytest.raises(DriveError, match=r"no answer to '/1 1 \d\d driver disable"):
-        line.talk(line.protocol.release("insertion"), None)
+        line.run(line.protocol.release("insertion"))
     assert 0.5 <= line.link.now - before < 0.6
 
 

@@ -65,6 +65,21 @@ def test_stop_is_repeated_until_the_drive_confirms_it(machine: DriveMachine) -> 
     assert not machine.ready
 
 
+@pytest.mark.parametrize(("moving", "at_rest"), [(20, 0), (0, 20)])
+def test_drive_that_stays_in_its_quick_stop_is_switched_off_and_on(
+    machine: DriveMachine, moving: int, at_rest: int
+) -> None:
+    enabled(machine)
+    machine.stop()
+    orders(machine, *[state(QUICK_STOP)] * at_rest)
+    machine.set_goal(Goal.ON)
+    orders(machine, *(state(QUICK_STOP, 100 * count) for count in range(moving)))
+    given = orders(machine, *[state(QUICK_STOP, 100 * max(moving - 1, 0))] * 12)
+    stopping = [] if at_rest else [DriveCommand.QUICK_STOP] * 2
+    enabling = [DriveCommand.ENABLE_OPERATION] * (10 - len(stopping))
+    assert given == [*stopping, *enabling, *[DriveCommand.DISABLE_VOLTAGE] * 2]
+
+
 @pytest.mark.parametrize("behind", [3, -3])
 def test_blocked_axis_is_released_when_stopped(machine: DriveMachine, behind: int) -> None:
     enabled(machine)

@@ -81,7 +81,6 @@ class DriveBench(SupervisorBench):
             self.axes[1],
             self.settings,
             feedback_delay=1,
-            is_switching=lambda: self.drives.needs_cycles,
         )
 
     def run(self, procedure: Procedure[T]) -> T:

@@ -63,6 +63,15 @@ def test_outer_end_is_negative_limit_or_home_switch() -> None:
             assert at.at_inner_switch is any(inputs & bits for bits in inner)
 
 
+def test_frames_of_a_wrong_length_are_counted_and_change_nothing() -> None:
+    bench = DriveBench().configured()
+    for number, cob_id in enumerate((0x181, 0x281, 0x701, 0x081), 1):
+        bench.bus.put(cob_id, b"\x01" * (cob_id != 0x701))
+        assert bench.link.bus_errors == number
+    bench.wait(2)
+    assert bench.state == "DISABLED"
+
+
 # ---- homing -------------------------------------------------------------------------------------
 
 
@@ -76,12 +85,12 @@ def again(bench: DriveBench, position: int, home_after: int) -> DriveBench:
     return bench
 
 
-def test_homing_ends_by_target_reached_if_attained_is_always_set() -> None:
+@pytest.mark.parametrize("under_way", [0x1000, 0x0400])
+def test_homing_ends_when_home_is_attained_and_the_target_reached(under_way: int) -> None:
     bench = again(DriveBench(), 3000, 20)
     bench.wait(4)
     for _ in range(15):
-        # Under way: attained once, not at the target.
-        bench.insertion.more_status = 0x1000
+        bench.insertion.more_status = under_way
         bench.wait()
         assert not bench.is_homed()
     bench.wait(20)
@@ -143,4 +152,5 @@ def test_axis_without_motor_gets_no_motion_commands_and_no_watchdog(home: int) -
     bench.wait(8)
     assert bench.reset().success
     assert bench.insertion.state == "disabled"
-    assert bench.run(bench.supervisor.deconfigure()).success
+    bench.run(bench.supervisor.deconfigure())
+    assert bench.state == "UNCONFIGURED"

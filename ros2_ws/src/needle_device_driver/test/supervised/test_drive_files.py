@@ -100,6 +100,8 @@ FATAL, OPTIONAL = "NOT USABLE: ", "optional: "
         ("605B", READ_ONLY, 0, OPTIONAL + "fixed at 2"),
         ("60C2sub2", {"LowLimit": "-0x2"}, 1, FATAL + "-3 is outside [-2, None]"),
         ("60C2sub2", {"LowLimit": "0xFD"}, 0, "ok"),
+        ("605A", {"DataType": "0x2"}, 0, "ok"),
+        ("6085", {"HighLimit": "0x7FFFFFFF"}, 0, "ok"),
         ("6085", {"HighLimit": "1000"}, 1, FATAL + "10000000 is outside [None, 1000]"),
         ("607A", {"PDOMapping": "0"}, 1, FATAL + "0x1601:1 0x607A cannot be mapped"),
         ("60A9", {"DefaultValue": "0x10300"}, 1, "the drive measures speeds in m/s"),

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from needle_core.can_frame import CanFrame
+from needle_core.commands.cli import EXIT_INTERNAL_ERROR
 from needle_core.component import LATCHED, Call, Component, Exit, Output
 from needle_core.runners.transport import Arrival, Arrivals, Link
 from needle_core.status_messages import DeviceStatus
@@ -15,7 +16,7 @@ from needle_device_driver.axes.axis import PERIOD
 from needle_device_driver.axes.link import DriveError
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig
 from needle_device_driver.device import JOINTS, STATUS
-from needle_device_driver.device_driver import EXIT_BROKEN, DeviceDriver
+from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.procedure import Procedure
 
 SYNC = 0x080
@@ -128,7 +129,7 @@ def test_internal_error_stops_both_axes(monkeypatch: pytest.MonkeyPatch) -> None
     assert DRIVER not in rig.runner.exits
     monkeypatch.setattr(rig.driver.supervisor, "drive", breaks)
     rig.runner.run(0.1)
-    assert rig.runner.exits[DRIVER] == Exit(EXIT_BROKEN, text)
+    assert rig.runner.exits[DRIVER] == Exit(EXIT_INTERNAL_ERROR, text)
     rig = ConformanceRig(1)
     rig.start()
     rig.call("device/confirm_needle_out", True)

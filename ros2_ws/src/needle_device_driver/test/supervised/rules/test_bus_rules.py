@@ -159,39 +159,6 @@ def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
 # ---- a drive that starts anew -------------------------------------------------------------------
 
 
-def set_up_again(bench: DriveBench) -> None:
-    bench.hold(False)
-    bench.wait(8)
-    assert bench.reset().success
-    bench.wait(5)
-    bench.enabled()
-
-
-def test_drive_reboot_allows_retraction_by_the_last_depth() -> None:
-    bench = DriveBench().moving()
-    bench.go(20)
-    # Farther than the outer software limit: without home, it is off.
-    deep, drawn_out = bench.insertion.position, 0
-    assert deep > 20_000
-    # After a second reboot, the remaining distance is allowed.
-    for cycles in (10, 100):
-        bench.after(bench.insertion.reboot)
-        bench.failed("drive_reboot", "home position is lost")
-        assert not bench.is_homed()
-        set_up_again(bench)
-        assert bench.insertion.nmt == 0x05
-        assert bench.insertion.value(0x1016, 1) == WATCHDOG
-        assert bench.insertion.value(0x607D, 1) == -(2**31)
-        bench.step()
-        assert bench.rule == "homed_first"
-        assert bench.retract().success
-        bench.go(cycles)
-        drawn_out -= bench.insertion.position
-    # The last feedback is a cycle old.
-    assert drawn_out == pytest.approx(deep, abs=4000)
-    assert bench.retract().message == "the needle is out"
-
-
 def test_drive_reboot_of_a_self_starting_drive_needs_a_new_set_up() -> None:
     bench = DriveBench().homed()
     for drive in (bench.insertion, bench.rotation):
