@@ -13,7 +13,7 @@ from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.component import Actions, Moment
 from needle_device_driver.conformance.rig import FASTEST, HandState
-from needle_sim.needle.bench import SimulatedBench
+from needle_sim.bench import SimulatedBench
 from needle_sim.sensors import Sensor, TipSensor
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
