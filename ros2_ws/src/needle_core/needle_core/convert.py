@@ -44,21 +44,9 @@ from needle_core.message_types import MessageTypes, to_nanoseconds
 from needle_core.status_messages import ControllerStatus, DeviceStatus, KeyValues
 
 
-class Converter:
-    """Converts messages to one family of ROS classes.
-
-    Parameters
-    ----------
-    types : MessageTypes
-        Family of classes.
-    """
-
-    def __init__(self, types: MessageTypes) -> None:
-        self._types = types
-
-    def to_ros(self, message: Any) -> Any:
-        """Return a message as a ROS message."""
-        return TABLE[type(message)].to_ros(message, self._types)
+def to_ros(message: Any, types: MessageTypes) -> Any:
+    """Return a message as a ROS message of a family of classes."""
+    return TABLE[type(message)].to_ros(message, types)
 
 
 def ros_type(kind: type[Any]) -> str:

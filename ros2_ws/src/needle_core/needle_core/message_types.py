@@ -55,6 +55,7 @@ def to_nanoseconds(stamp: Any) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
+@functools.cache
 def rclpy_types() -> MessageTypes:
     """Return the message classes of the installed ROS."""
 

@@ -38,7 +38,7 @@ from needle_core.component import (
     Service,
     Timer,
 )
-from needle_core.convert import Converter, from_ros, ros_type
+from needle_core.convert import from_ros, ros_type, to_ros
 from needle_core.errors import UserError
 from needle_core.message_types import rclpy_types
 from needle_core.process.ros_domain import CONFLICT_HINT, Claim
@@ -114,7 +114,6 @@ class ComponentNode(WholeNode):
             )
         self.exit: Exit | None = None
         self._types = rclpy_types()
-        self._converter = Converter(self._types)
         self._diagnostics = DiagnosticsPublisher(self)
         self._handlers = Handlers(self.component.outputs)
         self._logged: dict[str, float] = {}
@@ -270,7 +269,7 @@ class ComponentNode(WholeNode):
     def _execute(self, action: Action) -> None:
         match action:
             case Publish(topic, message):
-                self.outputs[topic].publish(self._converter.to_ros(message))
+                self.outputs[topic].publish(to_ros(message, self._types))
             case Send(port, batch):
                 self._ports[port].send(batch)
             case Call():
