@@ -167,11 +167,11 @@ class CanopenDevice(abc.ABC):
         for k in range(1, _HEARTBEAT_CONSUMERS + 1):
             writable(0x1016, k, Kind.U32, 0)
             # Monitoring starts with the first heartbeat after the configuration.
-            self._objects.on_write(0x1016, k, on_written=self._restart_monitoring)
+            self._objects.entry(0x1016, k).on_written = self._restart_monitoring
         writable(0x1017, 0, Kind.U16, 0)
         add(0x1029, 0, Kind.U8, 1)
-        writable(0x1029, 1, Kind.U8, _LEAVE_OPERATIONAL)
-        self._objects.on_write(0x1029, 1, check=one_of((_LEAVE_OPERATIONAL, _KEEP_STATE)))
+        choices = one_of((_LEAVE_OPERATIONAL, _KEEP_STATE))
+        writable(0x1029, 1, Kind.U8, _LEAVE_OPERATIONAL, check=choices)
 
     def _restart_monitoring(self, consumer: int) -> None:
         self._last_heartbeats.pop(consumer >> 16 & 0x7F, None)

@@ -82,8 +82,10 @@ class StoredObject:
         Whether a PDO may contain it.
     text : bytes
         The text; empty for a number.
-    check, on_written : callable, optional
-        Callbacks for writing, see `ObjectDictionary.on_write`.
+    check : callable, optional
+        Called before a client's value is stored; raises `SdoAbortError` to reject it.
+    on_written : callable, optional
+        Called with the value after it is stored.
     default : int
         The number after power-up.
     """
@@ -107,7 +109,6 @@ class ObjectDictionary:
 
     def __init__(self) -> None:
         self._entries: dict[tuple[int, int], StoredObject] = {}
-        self._indices: set[int] = set()
 
     def add(
         self,
@@ -119,34 +120,13 @@ class ObjectDictionary:
         writable: bool = False,
         mappable: bool = False,
         text: bytes = b"",
+        check: Callable[[int], None] | None = None,
     ) -> None:
         """Add an entry with the attributes of `StoredObject`."""
-        self._entries[index, subindex] = StoredObject(kind, value, writable, mappable, text)
-        self._indices.add(index)
+        entry = StoredObject(kind, value, writable, mappable, text, check)
+        self._entries[index, subindex] = entry
 
-    def on_write(
-        self,
-        index: int,
-        subindex: int,
-        *,
-        check: Callable[[int], None] | None = None,
-        on_written: Callable[[int], None] | None = None,
-    ) -> None:
-        """Set callbacks for writing an entry.
-
-        Parameters
-        ----------
-        index, subindex : int
-            Address of the entry.
-        check : callable, optional
-            Called with the value before it is stored; raises `SdoAbortError` to reject it.
-        on_written : callable, optional
-            Called with the value after it is stored.
-        """
-        entry = self._entries[index, subindex]
-        entry.check, entry.on_written = check, on_written
-
-    def entry(self, index: int, subindex: int) -> StoredObject:
+    def entry(self, index: int, subindex: int = 0) -> StoredObject:
         """Return an entry.
 
         Raises
@@ -156,7 +136,8 @@ class ObjectDictionary:
         """
         entry = self._entries.get((index, subindex))
         if entry is None:
-            raise SdoAbortError(Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT)
+            known = any(index == key[0] for key in self._entries)
+            raise SdoAbortError(Abort.NO_SUBINDEX if known else Abort.NO_OBJECT)
         return entry
 
     def value(self, index: int, subindex: int = 0) -> int:

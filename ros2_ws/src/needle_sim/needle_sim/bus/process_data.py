@@ -43,19 +43,15 @@ class _Pdo:
         self._mapping = mapping = self._first_mapping + number
         writable = partial(dictionary.add, writable=True)
         dictionary.add(parameters, 0, Kind.U8, max((2, *self._unused_parameters)))
-        writable(parameters, 1, Kind.U32, cob_id)
-        writable(parameters, 2, Kind.U8, _AT_ONCE[-1])
+        writable(parameters, 1, Kind.U32, cob_id, check=self._check_cob_id)
+        types = one_of((_EVERY_SYNC, *_AT_ONCE))
+        writable(parameters, 2, Kind.U8, _AT_ONCE[-1], check=types)
         for subindex in self._unused_parameters:
-            writable(parameters, subindex, Kind.U16, 0)
-            dictionary.on_write(parameters, subindex, check=one_of((0,)))
-        writable(mapping, 0, Kind.U8, len(mapped))
+            writable(parameters, subindex, Kind.U16, 0, check=one_of((0,)))
+        writable(mapping, 0, Kind.U8, len(mapped), check=self._check_count)
         for entry in range(1, _MOST_ENTRIES + 1):
             value = mapped[entry - 1] if entry <= len(mapped) else 0
-            writable(mapping, entry, Kind.U32, value)
-            dictionary.on_write(mapping, entry, check=self._check_entry)
-        dictionary.on_write(parameters, 1, check=self._check_cob_id)
-        dictionary.on_write(parameters, 2, check=one_of((_EVERY_SYNC, *_AT_ONCE)))
-        dictionary.on_write(mapping, 0, check=self._check_count)
+            writable(mapping, entry, Kind.U32, value, check=self._check_entry)
         # Cached, because they are read at every frame and every tick.
         self._mapping_entries = [dictionary.entry(mapping, k) for k in range(_MOST_ENTRIES + 1)]
         self._cob_id = dictionary.entry(parameters, 1)

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 
 from needle_core.can_frame import CAN, CanFrame
 from needle_sim.bus.canopen_device import SYNC
-from needle_sim.drives.emulated_drive import EmulatedDrive, EmulatedDriveSettings
+from needle_sim.drives.cia402 import EmulatedDriveSettings
+from needle_sim.drives.emulated_drive import EmulatedDrive
 from needle_sim.drives.emulated_drives import EmulatedDrives
 
 
