@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.disturbances import START, Disturbances, uniform_numbers
+from needle_sim.studies.disturbances import START, Disturbances, uniform_numbers, within_one
 from needle_sim.studies.figures_of_merit import Belief, Outcomes, Tally, concatenate
 from needle_sim.studies.needles import DisturbedNeedles
 
@@ -44,9 +44,8 @@ def cell_grid(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
 
 def random_starts(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
     """Return random starts, uniform within the bounds, as many as the grids have runs."""
-    numbers = uniform_numbers(seed, START, 0, 0, POINTS**3 * draws)
-    share = numbers[:, :3].astype(np.float64)
-    return np.asarray((2.0 * share - 1.0) * bounds.half_widths)
+    numbers = uniform_numbers(seed, START, 0, 0, POINTS**3 * draws)[:, :3]
+    return within_one(numbers) * bounds.half_widths
 
 
 GRIDS: Mapping[str, Callable[[StartBounds, int, int], FloatArray]] = {
