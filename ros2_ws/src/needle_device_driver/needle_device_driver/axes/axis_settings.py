@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated
 
-from needle_core.errors import OutOfBoundsError
-from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
-
-Positive = Annotated[float, Bounds(ABOVE_0, math.inf, "SI")]
 PRESENT_POSITION_METHODS = (35, 37)
 """CiA 402 homing methods that define the present position as home."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AxisSettings:
-    """Axis settings common to all kinds of drives; lengths in m or rad.
+    """Axis settings common to all kinds of drives, from checked parameters; lengths in m or rad.
 
     Attributes
     ----------
@@ -42,31 +37,19 @@ class AxisSettings:
         Whether the drive has a motor; otherwise the axis is moved by hand.
     """
 
-    counts_per_unit: Positive
+    counts_per_unit: float
     reverse: bool
-    speed: Positive
-    acceleration: Positive
-    quick_stop_deceleration: Positive
+    speed: float
+    acceleration: float
+    quick_stop_deceleration: float
     homing_method: int
-    following_error: Positive
+    following_error: float
     lower: float
     upper: float
-    tolerance: Positive
+    tolerance: float
     unit: str = "m"
     travel: float = math.inf
     actuated: bool = True
-
-    def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises
-        ------
-        UserError
-            If a value is out of bounds.
-        """
-        check_bounded_fields(self)
-        if not self.lower < self.upper:
-            raise OutOfBoundsError("lower", self.lower, -math.inf, self.upper, "SI")
 
     @property
     def direction(self) -> int:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
 
 from needle_core.errors import UserError
-from needle_core.settings.bounds import Bounds
-from needle_device_driver.axes.axis_settings import PRESENT_POSITION_METHODS, AxisSettings, Positive
+from needle_device_driver.axes.axis_settings import PRESENT_POSITION_METHODS, AxisSettings
 from needle_device_driver.axes.link import DriveError
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.object_access import ObjectAccess, ObjectError
@@ -37,8 +35,8 @@ class DriveSettings(AxisSettings):
         The drive's unit of speed [counts/s] and of ramps [counts/s^2].
     """
 
-    node_id: Annotated[int, Bounds(1, 126, "-")]
-    following_error_time: Positive
+    node_id: int
+    following_error_time: float
     max_torque: float
     counts_per_turn: float = 0.0
     speed_unit: float = 1.0
@@ -50,9 +48,8 @@ class DriveSettings(AxisSettings):
         Raises
         ------
         UserError
-            If a value is out of bounds or the homing method is unknown.
+            If the homing method is unknown.
         """
-        super().__post_init__()
         if self.homing_method not in HOMING_METHODS:
             raise UserError(f"homing_method = {self.homing_method} is not a CiA 402 method")
 

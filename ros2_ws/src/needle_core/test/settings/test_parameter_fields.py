@@ -1,15 +1,13 @@
-"""The check of bounds for all numbers of the user."""
+"""Parameters of a node: their types, bounds and choices, and their table."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated
 
 import pytest
 
-from needle_core.errors import OutOfBoundsError, UserError
-from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields, check_bounds
+from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import (
     check_fields,
     describe,
@@ -17,38 +15,6 @@ from needle_core.settings.parameter_fields import (
     from_values,
     parameter,
 )
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """Two numbers with bounds, and a text without."""
-
-    width: Annotated[float, Bounds(ABOVE_0, math.inf, "m")] = 1.0
-    noise: Annotated[float | None, Bounds(0.0, 5.0, "m")] = None
-    name: str = ""
-
-
-def test_a_value_within_its_bounds_passes() -> None:
-    check_bounded_fields(Settings())
-    check_bounded_fields(Settings(width=1e9, noise=5.0))
-    check_bounds("width", 0.0, 0.0, 1.0, "m")
-
-
-def test_a_value_out_of_bounds_is_reported_with_its_bounds() -> None:
-    for settings, cause in (
-        (Settings(width=0.0), r"width = 0 m is outside"),
-        (Settings(noise=5.1), r"noise = 5.1 m is outside \[0, 5\] m"),
-        (Settings(noise=2147483648.0), r"noise = 2147483648 m is outside"),
-        (Settings(noise=1e30), r"noise = 1e\+30 m is outside"),
-    ):
-        with pytest.raises(OutOfBoundsError, match=cause):
-            check_bounded_fields(settings)
-
-
-def test_nan_and_infinities_are_rejected() -> None:
-    for value in (math.nan, math.inf, -math.inf):
-        with pytest.raises(UserError, match=f"width = {value} m is not finite"):
-            check_bounded_fields(Settings(width=value))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +35,9 @@ def test_parameters_are_applied_with_their_types_or_rejected_with_the_node() -> 
     assert from_values(Parameters, values, "/rig") == Parameters(100.0, 1, (0.0, 9.0), "pid")
     for wrong, cause in (
         ({"rate": 100.1}, "rate = 100.1 Hz is outside [1, 100] Hz"),
+        *(({"rate": wrong}, f"rate = {wrong} Hz is not finite") for wrong in (math.nan, math.inf)),
+        ({"rate": 1e30}, "rate = 1e+30 Hz is outside [1, 100] Hz"),
+        ({"count": 2147483648}, "count = 2147483648 is outside [1, 9]"),
         ({"rate": 50}, "rate = 50 is not of type float (write 50.0)"),
         ({"count": True}, "count = True is of type bool, expected int"),
         ({"gains": [1.0, -0.1]}, "gains = -0.1 is outside [0, 9]"),
