@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 from collections.abc import Callable
+from typing import Any
 
 
 class Abort(enum.IntEnum):
@@ -74,8 +75,8 @@ class StoredObject:
     ----------
     kind : Kind or None
         Type of the number; None for a text.
-    value : int
-        The number; 0 for a text.
+    value, default : int
+        The number, now and after power-up; 0 for a text.
     writable : bool
         Whether a client may write it.
     mappable : bool
@@ -86,22 +87,16 @@ class StoredObject:
         Called before a client's value is stored; raises `SdoAbortError` to reject it.
     on_written : callable, optional
         Called with the value after it is stored.
-    default : int
-        The number after power-up.
     """
 
     kind: Kind | None
     value: int
+    default: int
     writable: bool = False
     mappable: bool = False
     text: bytes = b""
     check: Callable[[int], None] | None = None
     on_written: Callable[[int], None] | None = None
-    default: int = dataclasses.field(init=False)
-
-    def __post_init__(self) -> None:
-        """Store the power-up value."""
-        self.default = self.value
 
 
 class ObjectDictionary:
@@ -111,20 +106,10 @@ class ObjectDictionary:
         self._entries: dict[tuple[int, int], StoredObject] = {}
 
     def add(
-        self,
-        index: int,
-        subindex: int,
-        kind: Kind | None,
-        value: int = 0,
-        *,
-        writable: bool = False,
-        mappable: bool = False,
-        text: bytes = b"",
-        check: Callable[[int], None] | None = None,
+        self, index: int, subindex: int, kind: Kind | None, value: int = 0, **attributes: Any
     ) -> None:
         """Add an entry with the attributes of `StoredObject`."""
-        entry = StoredObject(kind, value, writable, mappable, text, check)
-        self._entries[index, subindex] = entry
+        self._entries[index, subindex] = StoredObject(kind, value, value, **attributes)
 
     def entry(self, index: int, subindex: int = 0) -> StoredObject:
         """Return an entry.

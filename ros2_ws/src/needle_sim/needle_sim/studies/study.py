@@ -32,14 +32,14 @@ class StartBounds:
         return np.array([self.x, self.pitch, self.roll])
 
 
-def endpoint_grid(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
-    """Return the 10 x 10 x 10 grid whose outermost points are the bounds."""
-    return _grid(np.linspace(-1.0, 1.0, POINTS), bounds, draws)
+def _grid(unit: FloatArray) -> Callable[[StartBounds, int, int], FloatArray]:
+    """Return the function of a 10 x 10 x 10 grid, with coordinates as shares of the bounds."""
 
+    def starts(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
+        points = np.stack(np.meshgrid(unit, unit, unit, indexing="ij"), axis=-1).reshape(-1, 3)
+        return np.repeat(points * bounds.half_widths, draws, axis=0)
 
-def cell_grid(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
-    """Return the centres of the 10 x 10 x 10 cells within the bounds."""
-    return _grid((2.0 * np.arange(POINTS) + 1.0) / POINTS - 1.0, bounds, draws)
+    return starts
 
 
 def random_starts(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
@@ -49,16 +49,12 @@ def random_starts(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
 
 
 GRIDS: Mapping[str, Callable[[StartBounds, int, int], FloatArray]] = {
-    "endpoint": endpoint_grid,
-    "cell": cell_grid,
+    # The outermost points of one grid are the bounds; the other one has cells within them.
+    "endpoint": _grid(np.linspace(-1.0, 1.0, POINTS)),
+    "cell": _grid((2.0 * np.arange(POINTS) + 1.0) / POINTS - 1.0),
     "random": random_starts,
 }
 """Functions of bounds, draws and seed; they return x [m], pitch, roll [rad], (1000 draws, 3)."""
-
-
-def _grid(unit: FloatArray, bounds: StartBounds, draws: int) -> FloatArray:
-    points = np.stack(np.meshgrid(unit, unit, unit, indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.repeat(points * bounds.half_widths, draws, axis=0)
 
 
 CHUNK = 500
@@ -205,7 +201,7 @@ def _steer(
 ) -> Outcomes:
     steps, true = settings.steps, needles.true
     tally = Tally(true.x, steps)
-    rate = controller.start(needles.measure_first())
+    rate = controller.start(needles.measured())
     insertion = 0.0
     for step in range(1, steps + 1):
         reached = min(step * settings.step_length, settings.depth)
