@@ -60,11 +60,8 @@ TRANSITIONS: dict[tuple[PowerState, PowerCommand], PowerState] = {
 
 def decode_command(controlword: int) -> PowerCommand | None:
     """Return the command of a controlword; None if it has none."""
-    for command in PowerCommand:
-        mask, value = command.value
-        if controlword & mask == value:
-            return command
-    return None
+    every = ((command, *command.value) for command in PowerCommand)
+    return next((command for command, mask, value in every if controlword & mask == value), None)
 
 
 def next_state(state: PowerState, controlword: int) -> PowerState:
