@@ -73,11 +73,10 @@ def test_a_small_bright_sphere_is_imaged_according_to_snells_law(
         expected = project(point, camera)
         corner = np.rint(expected).astype(int) - 4
         pixels = corner + np.mgrid[:9, :9].reshape(2, -1).T
-        light, cover, travelled = PathTracer(mitsuba).layer(
+        light, cover, travelled = PathTracer(mitsuba, rig).layer(
             scene,  # type: ignore[arg-type]
             pixels,
             camera,
-            rig,
             samples=256,
             key=[1],
         )

@@ -21,8 +21,8 @@ from needle_bags.ros.rerun import Node
 from needle_core.component import Actions, Moment, Publish
 from needle_core.convert import from_ros
 from needle_core.messages import Image, JointState, Pose, quaternion_from_rotation
+from needle_sim.bench import SimulatedBench
 from needle_sim.cameras import CameraSensor
-from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 from needle_tracker.optics.calibration import calibration_from
 from needle_tracker.stereo_tracker import TIP, StereoTipTracker
@@ -54,15 +54,7 @@ class FrozenRig:
 
     def __init__(self, run: Run) -> None:
         settings = parameters(run, "sim_rig", SimRigParameters)
-        self._bench = SimulatedBench(
-            curvature=settings.curvature,
-            pitch=settings.initial_pitch,
-            roll=settings.initial_roll,
-            torsion_play=settings.torsion_play,
-            torsion_lag=settings.torsion_lag,
-            tip_noise=settings.tip_noise,
-            seed=settings.seed,
-        )
+        self._bench = SimulatedBench(settings)
         self._cameras = CameraSensor(self._bench, settings)
         self._tracker = StereoTipTracker(
             parameters(run, "stereo_tracker", StereoTrackerParameters),

@@ -1,9 +1,6 @@
-"""Driver and emulated drives on a virtual clock, with other components and nodes beside them."""
+"""Driver and emulated drives on a virtual clock, with other nodes beside them."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from typing import Any
 
 from needle_core import messages as m
 from needle_core.component import (
@@ -12,36 +9,19 @@ from needle_core.component import (
     Action,
     Actions,
     Component,
-    Input,
     Moment,
     Output,
     Publish,
     Timer,
 )
-from needle_core.runners.transport import Fault
-from needle_core.status_messages import ControllerStatus, DeviceStatus
-from needle_device_driver.conformance.rig import ConformanceRig, RigClient
+from needle_core.status_messages import DeviceStatus
+from needle_device_driver.conformance.rig import ConformanceRig
 from needle_device_driver.rules import Rule
-from needle_sim.drives.emulated_bus import EmulatedBus
 
 HOLD = Output("device/hold", m.HoldState, BEST_EFFORT)
 COMMANDS = Output("device/joint_trajectory", m.Trajectory)
 ESTOP = Output("device/estop", m.EmergencyStop)
 STATUS = Output("device/status", DeviceStatus, LATCHED)
-
-
-class VirtualRigClient(RigClient):
-    """Also keeps the controller's status."""
-
-    def __init__(self, *, steers: bool) -> None:
-        super().__init__(steers=steers)
-        self.controller = ControllerStatus()
-        row = Input("needle/controller_status", ControllerStatus, self._on_controller, LATCHED)
-        self.inputs = (*self.inputs, row)
-
-    def _on_controller(self, message: ControllerStatus, _: Moment) -> Actions:
-        self.controller = message
-        return ()
 
 
 class SecondNode(Component):
@@ -66,26 +46,7 @@ class SecondNode(Component):
 
 
 class VirtualRig(ConformanceRig):
-    """Drives, driver, client and other components; a controller among them sends the commands."""
-
-    hand: VirtualRigClient
-
-    def __init__(
-        self,
-        seed: int,
-        *others: Component,
-        driver: Mapping[str, Any] | None = None,
-        drives: Mapping[str, Any] | None = None,
-        faults: Sequence[Fault] = (),
-    ) -> None:
-        hand = VirtualRigClient(steers=not others)
-        super().__init__(seed, *others, hand=hand, driver=driver, drives=drives, faults=faults)
-
-    @property
-    def bus(self) -> EmulatedBus:
-        """CAN bus with the CiA 402 drives."""
-        bus: EmulatedBus = self.drives.bus
-        return bus
+    """Drives, driver and client, beside which other nodes start."""
 
     def send(self, insertion: float, stamp_ns: int) -> None:
         """Send a step to a position [m] for the tip of a stamp [ns]."""

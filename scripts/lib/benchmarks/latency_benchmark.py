@@ -34,7 +34,7 @@ from needle_bags.reading.bag_reader import read_run
 from needle_bags.run.stage_timing import stage_timings
 from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter
 from needle_core.component import Actions
-from needle_core.convert import Converter
+from needle_core.convert import to_ros
 from needle_core.errors import UserError
 from needle_core.message_types import NANOSECONDS, rclpy_types, to_nanoseconds
 from needle_core.process.ros_domain import reserve_domain_id
@@ -183,7 +183,7 @@ class LatencyRig(RosRigClient):
         super().__init__()
         self._images = np.load(folder / _IMAGES_FILE)
         self._insertions = np.load(folder / _INSERTIONS_FILE)
-        self._converter = Converter(rclpy_types())
+        self._types = rclpy_types()
         rig = load_stereo_rig(calibration)
         self._views = [
             (
@@ -233,8 +233,9 @@ class LatencyRig(RosRigClient):
         pair = self._images[int(np.argmin(np.abs(self._insertions - insertion)))]
         for pixels, (camera, frame, image, info) in zip(pair, self._views, strict=True):
             camera_info = camera_info_message(camera, frame, exposed_ns)
-            info.publish(self._converter.to_ros(camera_info))
-            image.publish(self._converter.to_ros(image_message(pixels, frame, exposed_ns)))
+            info.publish(to_ros(camera_info, self._types))
+            pixels_message = image_message(pixels, frame, exposed_ns)
+            image.publish(to_ros(pixels_message, self._types))
         self.published += 1
 
     def _on_joints(self, message: JointState, info: dict[str, int]) -> None:

@@ -21,7 +21,6 @@ from needle_sim.drive_emulator import COUNTS_PER_RADIAN, DriveEmulatorParameters
 from scenario.faults import Fault, Kind
 from scenario.process_run import PARTS, run_processes
 from scenario.rig_run import RunResult
-from scenario.virtual_rig import VirtualRig
 
 STEPS = 10_000
 MOMENTS, DRIVE_MOMENTS = 50, 200
@@ -57,7 +56,7 @@ def random_steps(count: int) -> tuple[list[float], list[str], float]:
         Distance of the motors from the sum of all commands [counts], the results, and the growth of
         memory of this process [MB].
     """
-    rng, rig, memory = random.Random(1), VirtualRig(1), [0.0]
+    rng, rig, memory = random.Random(1), ConformanceRig(1), [0.0]
     rig.home()
     rig.press()
     at = list(rig.positions)

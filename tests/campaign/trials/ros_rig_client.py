@@ -15,7 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState, Joy
 from std_srvs.srv import SetBool, Trigger
 
-from needle_core.convert import Converter
+from needle_core.convert import to_ros
 from needle_core.errors import UserError
 from needle_core.message_types import rclpy_types
 from needle_core.messages import HoldSession
@@ -100,10 +100,7 @@ class RosRigClient(WholeNode):
         self._clients_of: dict[str, Any] = {
             name: self.create_client(kind, name) for name, kind in _SERVICES.items()
         }
-        self._session, self._converter = (
-            HoldSession(self.get_name(), math.inf),
-            Converter(rclpy_types()),
-        )
+        self._session, self._types = HoldSession(self.get_name(), math.inf), rclpy_types()
         if holds:
             self._hold = self.create_publisher(Joy, "device/hold", HOLD)
             self.create_timer(_HOLD_PERIOD, self.send_hold, clock=STEADY_CLOCK)
@@ -166,7 +163,7 @@ class RosRigClient(WholeNode):
     def send_hold(self) -> None:
         """Publish the hold."""
         message = self._session.next_message(time.time_ns(), pressed=self.pressed)
-        self._hold.publish(self._converter.to_ros(message))
+        self._hold.publish(to_ros(message, self._types))
 
     # ---- motion -------------------------------------------------------------------------------
 

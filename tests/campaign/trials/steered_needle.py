@@ -12,13 +12,12 @@ import numpy as np
 from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.component import Actions, Moment
-from needle_device_driver.conformance.rig import FASTEST, HandState
-from needle_sim.needle.bench import SimulatedBench
+from needle_device_driver.conformance.rig import FASTEST, ConformanceRig, HandState, RigClient
+from needle_sim.bench import SimulatedBench
 from needle_sim.sensors import Sensor, TipSensor
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
 from scenario.transport_faults import delay
-from scenario.virtual_rig import VirtualRig
 
 OFFSET = 0.003
 TIP_STD = 5e-5
@@ -93,13 +92,13 @@ def steer(
     sim = _SteeredRig(needle, new_sensor=new_sensor)
     driver = {"max_depth": steering.depth + 0.01, "insertion_drive": "hand" if pushed else "cia402"}
     late = (delay("needle/tip", latency),)
-    rig = VirtualRig(seed, sim, PlaneController(steering), driver=driver, faults=late)
+    controller, client = PlaneController(steering), RigClient(steers=False)
+    rig = ConformanceRig(seed, sim, controller, hand=client, driver=driver, faults=late)
     rig.home()
-    rig.until(lambda: rig.hand.controller.state == "IDLE", "the controller")
     rig.call("plane_controller/start")
-    rig.until(lambda: rig.hand.controller.state in _STEERING, "steering")
+    rig.until(lambda: controller.steering.state.value in _STEERING, "steering")
     begun, before = rig.runner.now, rig.runner.now
-    motor = rig.bus.drives["insertion"].motor
+    motor = rig.drives.bus.drives["insertion"].motor
     counts = rig.drives.settings.insertion_counts_per_unit
     path: list[tuple[float, float]] = []
 
@@ -111,9 +110,9 @@ def steer(
         path.append((bench.insertion, float(bench.tip[0])))
 
     sim.update = update
-    while rig.hand.controller.state in _STEERING and rig.runner.now < begun + _LONGEST:
+    while controller.steering.state.value in _STEERING and rig.runner.now < begun + _LONGEST:
         rig.runner.run(0.1)
-    return rig.hand.controller.state, np.array(path)
+    return controller.steering.state.value, np.array(path)
 
 
 def rms_at_end(path: np.ndarray, length: float = 0.02) -> float:

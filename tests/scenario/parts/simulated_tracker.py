@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from needle_core.component import Actions, Component, Moment, Port, Send, Timer
-from needle_sim.needle.bench import SimulatedBench
+from needle_sim.bench import SimulatedBench
 from plus_messages import transform_message
 
 Array = NDArray[np.float64]

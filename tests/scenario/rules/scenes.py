@@ -167,10 +167,9 @@ def axis_speed() -> None:
     scene = VirtualRig(
         1, drives={"rpm": True, "insertion_start": DEEP, "insertion_max_speed": 0.15}
     )
-    for drive in scene.bus.drives.values():
+    for drive in scene.drives.bus.drives.values():
         for key in [key for key in drive._objects._entries if key[0] in UNITS]:
             del drive._objects._entries[key]
-        drive._objects._indices.difference_update(UNITS)
     scene.begin_homing()
     scene.runner.run(1.0)
     assert scene.fails(Rule.AXIS_SPEED)
@@ -182,7 +181,7 @@ def software_limits() -> None:
     scene = VirtualRig(1)
     scene.home()
     for axis in AXES:
-        objects = scene.bus.drives[axis]._objects
+        objects = scene.drives.bus.drives[axis]._objects
         lower, upper = (
             int.from_bytes(objects.read(0x607D, sub), "little", signed=True) for sub in (1, 2)
         )
@@ -193,7 +192,7 @@ def drive_reboot() -> None:
     """A reboot of a drive is a fault, and named."""
     scene = VirtualRig(1, drives={"boot_time": 0.05})
     scene.ready()
-    scene.bus.reboot("rotation", scene.runner.now)
+    scene.drives.bus.reboot("rotation", scene.runner.now)
     scene.runner.run(1.0)
     assert scene.fails(Rule.DRIVE_REBOOT)
 

@@ -68,9 +68,7 @@ def test_a_step_moves_in_equal_cycles_to_its_target() -> None:
 
 def home(rig: VirtualRig) -> float:
     """Home the rig; return the duration from the answer on [s]."""
-    rig.until(lambda: rig.hand.status.state == "DISABLED", "the driver")
-    rig.call("device/confirm_needle_out", True)
-    rig.call("device/home")
+    rig.begin_homing()
     begin = rig.runner.now
     rig.until(lambda: rig.hand.status.homed, "homing")
     return rig.runner.now - begin

@@ -23,7 +23,7 @@ from needle_core import messages as m
 from needle_core.commands.cli import EXIT_DONE
 from needle_core.component import Output, Port
 from needle_core.runners.virtual import DIAGNOSTICS, VirtualRunner
-from needle_sim.needle.bench import SimulatedBench
+from needle_sim.bench import SimulatedBench
 from needle_sim.sensors import Sensor
 from needle_sim.sim_rig_parameters import SimRigParameters
 from needle_tracker.optics.calibration import pose_matrix

@@ -10,8 +10,6 @@ import math
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
-
 from needle_core import messages as m
 from needle_core.diagnostics import Level
 from needle_core.message_shapes import (
@@ -35,30 +33,15 @@ from needle_core.message_shapes import (
     Codec,
     Row,
     Shape,
-    duration,
     each,
-    empty,
-    fixed,
 )
 from needle_core.message_types import MessageTypes, to_nanoseconds
 from needle_core.status_messages import ControllerStatus, DeviceStatus, KeyValues
 
 
-class Converter:
-    """Converts messages to one family of ROS classes.
-
-    Parameters
-    ----------
-    types : MessageTypes
-        Family of classes.
-    """
-
-    def __init__(self, types: MessageTypes) -> None:
-        self._types = types
-
-    def to_ros(self, message: Any) -> Any:
-        """Return a message as a ROS message."""
-        return TABLE[type(message)].to_ros(message, self._types)
+def to_ros(message: Any, types: MessageTypes) -> Any:
+    """Return a message as a ROS message of a family of classes."""
+    return TABLE[type(message)].to_ros(message, types)
 
 
 def ros_type(kind: type[Any]) -> str:
@@ -80,8 +63,6 @@ _POINT = Shape(
     "trajectory_msgs/msg/JointTrajectoryPoint",
     positions=DOUBLES,
     velocities=DOUBLES.of("others"),
-    accelerations=empty(np.float64),
-    effort=empty(np.float64),
     time_from_start=DURATION,
 )
 
@@ -184,7 +165,6 @@ _REGION_ROW = Shape(
     y_offset=INT,
     height=INT,
     width=INT,
-    do_rectify=fixed(False),
 ).row(m.RegionOfInterest)
 _MARKER_ROW = Shape(
     "visualization_msgs/msg/Marker",
@@ -196,22 +176,7 @@ _MARKER_ROW = Shape(
     pose=POSE,
     scale=VECTOR,
     color=COLOUR.of("colour"),
-    lifetime=lambda t: duration(0.0, t),
-    frame_locked=fixed(False),
     points=each(POINT),
-    colors=lambda t: [],
-    texture_resource=fixed(""),
-    texture=Shape(
-        "sensor_msgs/msg/CompressedImage",
-        header=Shape("std_msgs/msg/Header", stamp=lambda t: t.time(0), frame_id=fixed("")),
-        format=fixed(""),
-        data=empty(np.uint8),
-    ),
-    uv_coordinates=lambda t: [],
-    text=fixed(""),
-    mesh_resource=fixed(""),
-    mesh_file=Shape("visualization_msgs/msg/MeshFile", filename=fixed(""), data=empty(np.uint8)),
-    mesh_use_embedded_materials=fixed(False),
 ).row(m.Marker)
 _LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40, "fatal": 50}
 _SEVERITIES = {level: name for name, level in _LEVELS.items()}
@@ -223,7 +188,6 @@ _SHAPES = {
         name=TEXTS.of("names"),
         position=DOUBLES.of("positions"),
         velocity=DOUBLES.of("velocities"),
-        effort=empty(np.float64),
     ),
     m.Trajectory: Shape(
         "trajectory_msgs/msg/JointTrajectory",
@@ -258,7 +222,6 @@ _SHAPES = {
         height=INT,
         width=INT,
         encoding=TEXT,
-        is_bigendian=fixed(0),
         step=INT,
         data=PIXELS,
     ),
@@ -286,9 +249,6 @@ _SHAPES = {
         level=Codec(lambda name, t: _LEVELS[name], lambda r: _SEVERITIES[int(r)]).of("severity"),
         name=Codec(lambda name, t: name.lstrip("/"), str).of("source"),
         msg=TEXT.of("text"),
-        file=fixed(""),
-        function=fixed(""),
-        line=fixed(0),
     ),
 }
 

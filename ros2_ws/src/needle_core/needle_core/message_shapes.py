@@ -36,45 +36,33 @@ class Value(NamedTuple):
     codec: Codec
 
 
-Constant = Callable[[MessageTypes], Any]
-"""Content of a field that is ignored in received messages."""
-
-
 class Shape:
-    """Fields of a ROS type that hold the attributes of a message.
+    """Fields of a ROS type that hold the attributes of a message; all others are empty or 0.
 
     Parameters
     ----------
     ros_type : str
         Name of the type.
-    fields : Codec, Value, Shape or Constant
+    fields : Codec, Value or Shape
         Content of each field. A codec alone stands for the attribute of the same name, and a nested
         shape holds attributes of the same message.
     """
 
-    def __init__(self, ros_type: str, **fields: Codec | Value | Shape | Constant) -> None:
+    def __init__(self, ros_type: str, **fields: Codec | Value | Shape) -> None:
         self.ros_type = ros_type
         self._values: dict[str, Value] = {}
         self._shapes: dict[str, Shape] = {}
-        self._constants: dict[str, Constant] = {}
         for name, field in fields.items():
-            match field:
-                case Codec():
-                    self._values[name] = field.of(name)
-                case Value():
-                    self._values[name] = field
-                case Shape():
-                    self._shapes[name] = field
-                case _:
-                    self._constants[name] = field
+            if isinstance(field, Shape):
+                self._shapes[name] = field
+            else:
+                self._values[name] = field.of(name) if isinstance(field, Codec) else field
 
     def to_ros(self, message: Any, t: MessageTypes) -> Any:
         """Return a message, or any object with its attributes, as a ROS message."""
-        fields = {name: constant(t) for name, constant in self._constants.items()}
+        fields = {name: shape.to_ros(message, t) for name, shape in self._shapes.items()}
         for name, (attribute, codec) in self._values.items():
             fields[name] = codec.to_ros(getattr(message, attribute), t)
-        for name, shape in self._shapes.items():
-            fields[name] = shape.to_ros(message, t)
         return t.make(self.ros_type)(**fields)
 
     def values(self, message: Any) -> dict[str, Any]:
@@ -123,16 +111,6 @@ def duration(seconds: float, t: MessageTypes) -> Any:
     return t.make("builtin_interfaces/msg/Duration")(sec=sec, nanosec=nanosec)
 
 
-def fixed(value: Any) -> Constant:
-    """Return a constant as the content of a field."""
-    return lambda t: value
-
-
-def empty(dtype: type[np.generic]) -> Constant:
-    """Return an empty sequence of numbers as the content of a field."""
-    return lambda t: t.array(dtype, ())
-
-
 BOOL, INT, TEXT = same(bool), same(int), same(str)
 TEXTS = Codec(lambda values, t: list(values), tuple)
 DOUBLES, FLOATS, INTS = numbers(np.float64), numbers(np.float32), numbers(np.int32, int)
@@ -146,5 +124,5 @@ QUATERNION = components("geometry_msgs/msg/Quaternion", "xyzw")
 COLOUR = components("std_msgs/msg/ColorRGBA", "rgba")
 
 HEADER = Shape("std_msgs/msg/Header", stamp=STAMP.of("stamp_ns"), frame_id=TEXT)
-ONLY_STAMP = Shape("std_msgs/msg/Header", stamp=STAMP.of("stamp_ns"), frame_id=fixed(""))
+ONLY_STAMP = Shape("std_msgs/msg/Header", stamp=STAMP.of("stamp_ns"))
 POSE = Shape("geometry_msgs/msg/Pose", position=POINT, orientation=QUATERNION)

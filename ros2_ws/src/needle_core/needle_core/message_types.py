@@ -55,6 +55,7 @@ def to_nanoseconds(stamp: Any) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
+@functools.cache
 def rclpy_types() -> MessageTypes:
     """Return the message classes of the installed ROS."""
 
@@ -75,9 +76,24 @@ def rclpy_types() -> MessageTypes:
 
 def rosbags_types(store: Any) -> MessageTypes:
     """Return the message classes of one of rosbags' type stores."""
-    return MessageTypes(
-        lambda name: store.types[name],
+
+    def lookup(name: str) -> Any:
+        # Unlike those of rclpy, these classes have no default values.
+        blank = {field: empty(*content) for field, content in store.fielddefs[name][1]}
+        return partial(store.types[name], **blank)
+
+    def empty(node: Any, content: Any) -> Any:
+        match node.name:
+            case "NAME":
+                return types.make(content)()
+            case "BASE":
+                return "" if content[0] == "string" else 0
+        return [] if content[0][0].name == "NAME" else np.zeros(0)
+
+    types = MessageTypes(
+        lookup,
         lambda kind, values: np.array(values, dtype=kind),
         lambda value: value,
         partial(np.frombuffer, dtype=np.uint8),
     )
+    return types

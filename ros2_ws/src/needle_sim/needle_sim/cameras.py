@@ -23,11 +23,11 @@ from needle_core.component import (
     Send,
 )
 from needle_core.files.installed import find_shared_file
+from needle_sim.bench import SimulatedBench
 from needle_sim.camera.image_folder import ImageFolder, RenderedPair, truth_of
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import SCENARIOS
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
-from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 CAMERAS = "cameras"

@@ -11,7 +11,7 @@ from needle_device_driver.device import EMERGENCY_STOP, DeviceInterface
 from needle_device_driver.procedure import Procedure, run_at_once
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
-from needle_sim.needle.bench import SimulatedBench
+from needle_sim.bench import SimulatedBench
 
 CYCLE = 0.02
 """Period of the axes' set-points [s]."""

@@ -27,9 +27,8 @@ from needle_core.component import (
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
-from needle_sim.drives.cia402 import SERVO, STEPPER
+from needle_sim.drives.cia402 import SERVO, STEPPER, EmulatedDriveSettings
 from needle_sim.drives.emulated_bus import EmulatedBus
-from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.emulated_drives import FAULT, AxisState, EmulatedDrives
 from needle_sim.drives.motor import MotorSettings
 

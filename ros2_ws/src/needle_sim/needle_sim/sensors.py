@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
+import numpy as np
+
 from needle_core import messages as m
 from needle_core.component import Actions, Output, Port, Publish
-from needle_sim.needle.bench import SimulatedBench
+from needle_sim.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 RIG = "rig"
@@ -16,6 +18,8 @@ _UNKNOWN_ORIENTATION = 1e6
 # A variance of 0 would mean "unknown" [m^2].
 _MIN_POSITION_VARIANCE = 1e-12
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+# Random stream of the tip noise; streams 0 and 1 belong to the left and the right image.
+_STREAM = 4
 
 
 class Sensor(Protocol):
@@ -40,7 +44,7 @@ class Sensor(Protocol):
 
 
 class TipSensor:
-    """Sensor of level `tip`: the tip position with uniform noise.
+    """Sensor of level `tip`: the tip with the uniform noise of [KC09] section IV.
 
     Parameters
     ----------
@@ -55,7 +59,7 @@ class TipSensor:
 
     def __init__(self, bench: SimulatedBench, settings: SimRigParameters) -> None:
         self._bench = bench
-        self._noise = settings.tip_noise
+        self._noise, self._seed = settings.tip_noise, settings.seed
         self.outputs: tuple[Output, ...] = (
             Output("needle/tip_pose", m.PoseWithCovariance),
             Output("needle/tip", m.Point),
@@ -63,7 +67,8 @@ class TipSensor:
 
     def expose(self, number: int, stamp_ns: int) -> Actions:
         """Return the measured tip, first with its covariance."""
-        x, y, z = (float(c) for c in self._bench.measure_tip(number))
+        rng = np.random.default_rng([self._seed, number, _STREAM])
+        x, y, z = (self._bench.tip + rng.uniform(-self._noise, self._noise, 3)).tolist()
         variance = max(self._noise**2 / 3.0, _MIN_POSITION_VARIANCE)
         covariance = [0.0] * 36
         covariance[::7] = [variance] * 3 + [_UNKNOWN_ORIENTATION] * 3

@@ -21,8 +21,8 @@ from needle_core.component import (
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import quaternion_from_rotation
 from needle_core.status_messages import ControllerStatus
+from needle_sim.bench import SimulatedBench
 from needle_sim.devices import CYCLE, IdealDevice, MotorFollower
-from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import RIG, Sensor, make_sensor
 from needle_sim.sim_rig_parameters import SimRigParameters
 
@@ -55,15 +55,7 @@ class SimRig(Component):
         now: float = 0.0,
     ) -> None:
         self.name, self.settings = name, settings
-        self._bench = SimulatedBench(
-            curvature=settings.curvature,
-            pitch=settings.initial_pitch,
-            roll=settings.initial_roll,
-            torsion_play=settings.torsion_play,
-            torsion_lag=settings.torsion_lag,
-            tip_noise=settings.tip_noise,
-            seed=settings.seed,
-        )
+        self._bench = SimulatedBench(settings)
         self._device: IdealDevice | MotorFollower
         if settings.level == "drive":
             self._device = MotorFollower(self._bench)

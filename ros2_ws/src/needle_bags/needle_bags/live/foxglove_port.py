@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.live.live_view import Watched
 from needle_core.component import Batch, Log, Output
-from needle_core.convert import Converter, ros_type
+from needle_core.convert import ros_type, to_ros
 from needle_core.errors import UserError
 from needle_core.message_types import rosbags_types
 from needle_core.settings.parameter_files import absolute_name
@@ -38,7 +38,7 @@ class FoxglovePort(ServerListener):
     def __init__(self, port: int, channels: Iterable[Output]) -> None:
         self.port = port
         self._store = get_typestore(Stores.ROS2_JAZZY)
-        self._converter = Converter(rosbags_types(self._store))
+        self._types = rosbags_types(self._store)
         self._context = foxglove.Context()
         self._rows = {row.topic: row for row in channels}
         self._channels = {topic: self._channel(row) for topic, row in self._rows.items()}
@@ -70,7 +70,7 @@ class FoxglovePort(ServerListener):
     def send(self, batch: tuple[tuple[str, Any, int], ...]) -> None:
         """Send topics, messages and times [ns]; a slow client misses old messages."""
         for topic, message, stamp_ns in batch:
-            ros_message = self._converter.to_ros(message)
+            ros_message = to_ros(message, self._types)
             data = bytes(self._store.serialize_cdr(ros_message, ros_type(type(message))))
             if self._rows[topic].delivery.latched:
                 self._latched[topic] = data, stamp_ns

@@ -21,7 +21,7 @@ from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter, standard_topic
 from needle_bags.recording.provenance import commit, distribution, versions
 from needle_core.component import Component, Delivery, Input, Output
-from needle_core.convert import Converter, ros_type
+from needle_core.convert import ros_type, to_ros
 from needle_core.files.bag_topic import BagTopic
 from needle_core.files.mcap_file import RUN_RECORD
 from needle_core.message_types import rosbags_types
@@ -52,7 +52,7 @@ class BagTap:
     ) -> None:
         components = list(components)
         self._store = get_typestore(Stores.ROS2_JAZZY)
-        self._converter = Converter(rosbags_types(self._store))
+        self._types = rosbags_types(self._store)
         self._writer = BagWriter(directory, distribution=distribution(), describe_itself=False)
         self._sequence: Counter[tuple[str, str]] = Counter()
         rows: list[Input | Output] = [*others]
@@ -71,7 +71,7 @@ class BagTap:
 
     def __call__(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
         """Write a publication."""
-        ros_message = self._converter.to_ros(message)
+        ros_message = to_ros(message, self._types)
         data = bytes(self._store.serialize_cdr(ros_message, ros_type(output.message)))
         self._sequence[sender, output.topic] += 1
         sequence = self._sequence[sender, output.topic]

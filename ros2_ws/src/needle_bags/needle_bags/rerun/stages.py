@@ -12,14 +12,14 @@ from rosbags.typesys import Stores, get_typestore
 from needle_bags.reading.bag_images import plain_image
 from needle_bags.reading.bag_messages import SentMessage
 from needle_core.component import Component, Moment, Publish
-from needle_core.convert import Converter, from_ros
+from needle_core.convert import from_ros, to_ros
 from needle_core.message_types import rosbags_types
 from needle_core.messages import Image
 from needle_core.runners.bag import BagRunner
 
 _STORE = get_typestore(Stores.ROS2_JAZZY)
-CONVERTER = Converter(rosbags_types(_STORE))
-"""Converts to rosbags messages."""
+TYPES = rosbags_types(_STORE)
+"""rosbags' message classes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,4 +113,4 @@ class BagStage(Stage):
 
 def _output(action: Publish, log_time: int) -> Output:
     stamp = getattr(action.message, "stamp_ns", log_time)
-    return Output(action.topic, log_time, stamp, CONVERTER.to_ros(action.message))
+    return Output(action.topic, log_time, stamp, to_ros(action.message, TYPES))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_bags.reading.bag_messages import SentMessage, messages_as_sent
-from needle_bags.rerun.stages import CONVERTER, Output, Stage
+from needle_bags.rerun.stages import TYPES, Output, Stage
 from needle_bags.ros.parameter_snapshots import plain_value
 from needle_controller.plane_controller import (
     STATUS,
@@ -23,7 +23,7 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import SteeringState
 from needle_controller.protocol.joint_history import JointSample
 from needle_core.component import Actions, Input, Moment, Publish
-from needle_core.convert import from_ros
+from needle_core.convert import from_ros, to_ros
 from needle_core.errors import UserError
 from needle_core.message_types import to_nanoseconds
 from needle_core.messages import JointState
@@ -92,7 +92,7 @@ class ControllerStage(Stage):
             if not isinstance(action, Publish) or action.topic == STATUS:
                 continue
             self.tips += action.topic == "needle/estimate"
-            content = CONVERTER.to_ros(action.message)
+            content = to_ros(action.message, TYPES)
             outputs.append(Output(action.topic, sent.log_time, action.message.stamp_ns, content))
         return outputs
 

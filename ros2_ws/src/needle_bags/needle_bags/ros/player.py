@@ -35,8 +35,9 @@ from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.files.bag_directory import BagDirectory, SentMessage
 from needle_core.files.bag_topic import BagTopic
+from needle_core.message_types import rclpy_types
 from needle_core.process.shutdown import ShutdownFlag
-from needle_core.ros.base_node import RELIABLE, DiagnosticsPublisher, WholeNode, to_stamp
+from needle_core.ros.base_node import RELIABLE, DiagnosticsPublisher, WholeNode
 from needle_core.ros.main import run_node
 from needle_core.ros.parameters import NodeParameters
 from needle_core.settings.parameter_fields import check_fields, parameter
@@ -225,7 +226,7 @@ class Player(WholeNode):
         now = time.monotonic()
         if self._options.clock is not None and now >= self._next_clock:
             self._next_clock = now + 1.0 / self._options.clock
-            self._senders[CLOCK].publish(Clock(clock=to_stamp(self.clock.time(now))))
+            self._senders[CLOCK].publish(Clock(clock=rclpy_types().time(self.clock.time(now))))
         if now - self._checked_at < CHECK_PERIOD:
             return
         self._checked_at = now

@@ -29,7 +29,7 @@ from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import Parameters
 from needle_core.status_messages import ControllerStatus
-from needle_sim.needle.bench import SimulatedBench
+from needle_sim.bench import SimulatedBench
 from needle_sim.sensors import Sensor, make_sensor
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters

@@ -11,16 +11,16 @@ from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.vision import VISION, RemoteTracker, make_vision
 from needle_core import messages as m
 from needle_core.component import Exit, Moment, PortChange, Publish, Send
+from needle_sim.bench import SimulatedBench
 from needle_sim.cameras import CAMERAS, Exposure
-from needle_sim.needle.bench import SimulatedBench
+from needle_sim.sim_rig_parameters import SimRigParameters
 
 PARAMETERS = command_line_parameters(parse(["--level", "camera"]), Path())
-STRAIGHT = {"pitch": 0.0, "roll": 0.0, "torsion_play": 0.0, "torsion_lag": 0.0, "tip_noise": 0.0}
 AT = Moment(3.0, 4_000_000_000)
 
 
 def exposure(insertion: float, stamp_ns: int = AT.stamp_ns) -> Exposure:
-    bench = SimulatedBench(curvature=1.0 / 0.122, seed=1, **STRAIGHT)
+    bench = SimulatedBench(SimRigParameters())
     bench.move_to(insertion, 0.0)
     return Exposure.of(bench, 3, stamp_ns)
 

@@ -26,23 +26,6 @@ _INCOMPLETE = (0, 1)
 _CREATION_TIME = 1.0
 
 
-def dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
-    """Return the names of the shared-memory ports on which no running process listens.
-
-    Parameters
-    ----------
-    ports : iterable of int
-        Port numbers to look for.
-    folder : Path
-        Where shared memory is mounted.
-    """
-    return [
-        name
-        for name in (f"{_PREFIX}port{port}" for port in ports)
-        if any(path.exists() for path in _files(folder, name)) and not _is_held(folder, name)
-    ]
-
-
 def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> None:
     """Remove the ports on which no running process listens, except those of other users.
 
@@ -53,8 +36,8 @@ def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> Non
     folder : Path
         Where shared memory is mounted.
     """
-    for name in dead_ports(ports, folder):
-        for path in _files(folder, name):
+    for name in (f"{_PREFIX}port{port}" for port in ports):
+        for path in () if _is_held(folder, name) else _files(folder, name):
             with contextlib.suppress(OSError):
                 path.unlink()
 

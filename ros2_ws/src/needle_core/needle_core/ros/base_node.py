@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -15,14 +14,13 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from needle_core import component
 from needle_core.component import Delivery
-from needle_core.convert import Converter
+from needle_core.convert import to_ros
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.message_types import rclpy_types
 from needle_core.messages import Diagnostics, Status
 
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 _TYPES = rclpy_types()
-_CONVERTER = Converter(_TYPES)
 _MAX_TEXT_LENGTH = 200
 # Name that the graph reports for a node while only its endpoint has been discovered.
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
@@ -82,7 +80,7 @@ def _name_of(info: Any) -> str:
     return full_name(info.node_namespace, info.node_name) if known else ""
 
 
-# ---- quality of service, time, key-value pairs ------------------------------------------------
+# ---- quality of service, key-value pairs ------------------------------------------------------
 
 
 def to_qos(delivery: Delivery) -> QoSProfile:
@@ -102,12 +100,6 @@ LATCHED = to_qos(component.LATCHED)
 HOLD = to_qos(component.BEST_EFFORT)
 IMAGES = to_qos(component.IMAGES)
 IMAGES_BEST_EFFORT = to_qos(component.IMAGES_BEST_EFFORT)
-
-
-def to_stamp(nanoseconds: int) -> Time:
-    """Return a time [ns] as a message stamp, clipped to the range of a stamp."""
-    stamp: Time = _TYPES.time(nanoseconds)
-    return stamp
 
 
 def values_of(status: DiagnosticStatus) -> dict[str, str]:
@@ -169,4 +161,4 @@ class DiagnosticsPublisher:
         name = signature(self._node)
         statuses = tuple(Status.of(name, part, self._parts[part]) for part in parts)
         stamp_ns = self._node.get_clock().now().nanoseconds
-        self._publisher.publish(_CONVERTER.to_ros(Diagnostics(stamp_ns, statuses)))
+        self._publisher.publish(to_ros(Diagnostics(stamp_ns, statuses), _TYPES))

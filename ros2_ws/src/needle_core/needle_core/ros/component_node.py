@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -38,7 +39,7 @@ from needle_core.component import (
     Service,
     Timer,
 )
-from needle_core.convert import Converter, from_ros, ros_type
+from needle_core.convert import from_ros, ros_type, to_ros
 from needle_core.errors import UserError
 from needle_core.message_types import rclpy_types
 from needle_core.process.ros_domain import CONFLICT_HINT, Claim
@@ -114,14 +115,13 @@ class ComponentNode(WholeNode):
             )
         self.exit: Exit | None = None
         self._types = rclpy_types()
-        self._converter = Converter(self._types)
         self._diagnostics = DiagnosticsPublisher(self)
         self._handlers = Handlers(self.component.outputs)
         self._logged: dict[str, float] = {}
         self.peers = Peers()
         self._requests: dict[int, Future[Reply]] = {}
         self._calls: dict[int, tuple[Call, float, Future[Any] | None]] = {}
-        self._numbers = 0
+        self._numbers = itertools.count(1)
         self._service_clients: dict[str, Client[Any, Any]] = {}
         self._ports = dict(ports(settings))
         self._arrived: deque[tuple[str, Any]] = deque()
@@ -226,7 +226,7 @@ class ComponentNode(WholeNode):
 
     def _offer(self, service: Service) -> None:
         async def answer(request: Any, response: Any) -> Any:
-            number = self._number()
+            number = next(self._numbers)
             reply: Future[Reply] = Future(executor=self.executor)
             self._requests[number] = reply
             argument = request.data if service.has_argument else None
@@ -253,10 +253,7 @@ class ComponentNode(WholeNode):
             for row in self.component.ports:
                 if row.name == name:
                     handler = row.handler if isinstance(batch, tuple) else row.on_change
-                    self._handle(partial(self._call_handler, handler, batch))
-
-    def _call_handler(self, handler: Callable[[Any, Moment], Actions], batch: Any) -> Actions:
-        return handler(batch, self._moment())
+                    self._handle(lambda: handler(batch, self._moment()))  # noqa: B023 - called now
 
     # ---- actions ------------------------------------------------------------------------------
 
@@ -270,7 +267,7 @@ class ComponentNode(WholeNode):
     def _execute(self, action: Action) -> None:
         match action:
             case Publish(topic, message):
-                self.outputs[topic].publish(self._converter.to_ros(message))
+                self.outputs[topic].publish(to_ros(message, self._types))
             case Send(port, batch):
                 self._ports[port].send(batch)
             case Call():
@@ -302,10 +299,6 @@ class ComponentNode(WholeNode):
         else:
             self.get_logger().info(line.text)
 
-    def _number(self) -> int:
-        self._numbers += 1
-        return self._numbers
-
     # ---- calls --------------------------------------------------------------------------------
 
     def _call(self, call: Call) -> None:
@@ -314,7 +307,7 @@ class ComponentNode(WholeNode):
             kind = Trigger if call.request is None else SetBool
             client = self.create_client(kind, call.service, callback_group=self._group)
             self._service_clients[call.service] = client
-        number = self._number()
+        number = next(self._numbers)
         future: Future[Any] | None = None
         if client.service_is_ready() or client.wait_for_service(0.0):
             has_argument = call.request is not None

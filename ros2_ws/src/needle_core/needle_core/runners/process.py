@@ -117,7 +117,6 @@ class Process:
         self._free_at = self._frozen_until = 0.0
         self._queue: deque[tuple[str, Work, int]] = deque()
         self._waiting: Counter[str] = Counter()
-        self._streams: dict[str, random.Random] = {}
         self._handlers = Handlers(component.outputs)
 
     @property
@@ -175,9 +174,7 @@ class Process:
     def _handle_now(self, source: str, work: Work, sent_ns: int) -> None:
         at = self._timeline.moment(sent_ns)
         actions = self._handlers.run(lambda: work(at))
-        stream = self._streams.get(source)
-        if stream is None:
-            stream = self._streams[source] = self._timeline.stream(f"{self.name}/{source}")
+        stream = self._timeline.stream(f"{self.name}/{source}")
         seconds = self._compute(actions, stream) + self.slowness
         self._free_at = self._timeline.now + seconds
         if actions:

@@ -55,7 +55,6 @@ class Transport:
     def __init__(self, timeline: Timeline, faults: Sequence[Fault]) -> None:
         self._timeline = timeline
         self._faults = faults
-        self._streams: dict[Link, random.Random] = {}
         self._arrived: dict[Link, float] = {}
 
     def send(
@@ -66,10 +65,7 @@ class Transport:
         arrive: Callable[[Any], None],
     ) -> None:
         """Send a message; `arrive` is called for each resulting arrival."""
-        stream = self._streams.get(link)
-        if stream is None:
-            stream = self._streams[link] = self._timeline.stream("/".join(link))
-        timeline = self._timeline
+        timeline, stream = self._timeline, self._timeline.stream("/".join(link))
         now = timeline.now
         arrivals = [Arrival(stream.uniform(*latency), message)]
         for fault in self._faults:

@@ -12,9 +12,10 @@ import pytest
 
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import Claim, ports_of, reserve_domain_id
-from needle_core.process.shared_memory import dead_ports, remove_dead_ports, remove_incomplete_ports
+from needle_core.process.shared_memory import remove_dead_ports, remove_incomplete_ports
 
 PORTS = range(7400, 7410)
+FILES = (("fastrtps_port", ""), ("fastrtps_port", "_el"), ("sem.fastrtps_port", "_mutex"))
 
 
 def test_the_second_claim_names_the_holder_and_a_released_name_is_free() -> None:
@@ -30,10 +31,9 @@ def test_the_second_claim_names_the_holder_and_a_released_name_is_free() -> None
 
 def make_port(folder: Path, port: int) -> Path:
     """Make the three files of a port; return the one that its listener locks."""
-    lock = folder / f"fastrtps_port{port}_el"
-    for path in (lock, folder / f"fastrtps_port{port}", folder / f"sem.fastrtps_port{port}_mutex"):
-        path.write_bytes(b"")
-    return lock
+    for name, end in FILES:
+        (folder / f"{name}{port}{end}").write_bytes(b"")
+    return folder / f"fastrtps_port{port}_el"
 
 
 def test_dead_ports_are_removed_and_others_stay(tmp_path: Path) -> None:
@@ -41,25 +41,19 @@ def test_dead_ports_are_removed_and_others_stay(tmp_path: Path) -> None:
     listener = make_port(tmp_path, 7401)
     make_port(tmp_path, 7402).unlink()
     make_port(tmp_path, 7410)
+    left = {f"{name}7410{end}" for name, end in FILES}
     with listener.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        assert dead_ports(PORTS, tmp_path) == ["fastrtps_port7400", "fastrtps_port7402"]
         remove_dead_ports(PORTS, tmp_path)
-        assert dead_ports(PORTS, tmp_path) == []
-        assert (tmp_path / "fastrtps_port7401").exists()
-    assert dead_ports(PORTS, tmp_path) == ["fastrtps_port7401"]
+        held = {f"{name}7401{end}" for name, end in FILES}
+        assert {path.name for path in tmp_path.iterdir()} == left | held
     remove_dead_ports(PORTS, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "fastrtps_port7410",
-        "fastrtps_port7410_el",
-        "sem.fastrtps_port7410_mutex",
-    }
+    assert {path.name for path in tmp_path.iterdir()} == left
 
 
 def test_a_domain_has_one_holder_and_is_left_clean() -> None:
     with reserve_domain_id() as domain, reserve_domain_id() as another:
         assert domain != another
-        assert dead_ports(ports_of(domain)) == []
         port = Path("/dev/shm") / f"fastrtps_port{ports_of(domain)[11]}"
         port.write_bytes(b"")
     assert not port.exists()

@@ -11,7 +11,7 @@ PRESENT_POSITION_METHODS = (35, 37)
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AxisSettings:
-    """Axis settings common to all kinds of drives; lengths in m or rad.
+    """Axis settings common to all kinds of drives, from checked parameters; lengths in m or rad.
 
     The parameters that they come from are checked.
 

@@ -48,7 +48,7 @@ class DriveSettings(AxisSettings):
         Raises
         ------
         UserError
-            If it is unknown.
+            If the homing method is unknown.
         """
         if self.homing_method not in HOMING_METHODS:
             raise UserError(f"homing_method = {self.homing_method} is not a CiA 402 method")

@@ -68,6 +68,8 @@ def test_invalid_settings_and_parameters_are_refused() -> None:
         {"channel": ""},
         {"insertion_drive": "foot"},
         {"bitrate": 123_456},
+        *({f"insertion_{name}": 0.0} for name in ("counts_per_unit", "quick_stop_deceleration")),
+        *({"max_speed": speed} for speed in (0.0, 0.006)),
         {"watchdog": 0.501},
     ]
     for changes in parameters:

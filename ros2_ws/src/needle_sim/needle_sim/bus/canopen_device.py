@@ -8,7 +8,7 @@ from functools import partial
 
 from needle_core.can_frame import CanFrame
 from needle_sim.bus.object_dictionary import Kind, ObjectDictionary, SdoServer, one_of
-from needle_sim.bus.process_data import INVALID, ReceivePdo, TransmitPdo
+from needle_sim.bus.process_data import ReceivePdo, TransmitPdo
 
 NMT = 0x000
 SYNC = 0x080
@@ -16,9 +16,7 @@ EMERGENCY = 0x080
 SDO_ANSWER = 0x580
 SDO_REQUEST = 0x600
 HEARTBEAT = 0x700
-# COB-IDs of the predefined connection set.
-_RECEIVE = (0x200, 0x300, 0x400, 0x500)
-_TRANSMIT = (0x180, 0x280, 0x380, 0x480)
+_PDOS = 4
 _HEARTBEAT_CONSUMERS = 2
 HEARTBEAT_LOST = 0x8130
 _COMMUNICATION_ERROR = 0x10
@@ -72,19 +70,9 @@ class CanopenDevice(abc.ABC):
         self._last_heartbeats: dict[int, float] = {}
         self._sdo = SdoServer(dictionary)
         self._add_communication_objects()
-
-        def cob_ids(codes: tuple[int, ...]) -> list[int]:
-            """Return the identifiers after power-up, when only the first PDO is enabled."""
-            return [code + node_id | (INVALID if k else 0) for k, code in enumerate(codes)]
-
-        self._receive = [
-            ReceivePdo(dictionary, k, cob_id, () if k else default_receive)
-            for k, cob_id in enumerate(cob_ids(_RECEIVE))
-        ]
-        self._transmit = [
-            TransmitPdo(dictionary, k, cob_id, () if k else default_transmit)
-            for k, cob_id in enumerate(cob_ids(_TRANSMIT))
-        ]
+        numbers = range(_PDOS)
+        self._receive = [ReceivePdo(dictionary, k, node_id, default_receive) for k in numbers]
+        self._transmit = [TransmitPdo(dictionary, k, node_id, default_transmit) for k in numbers]
 
     @abc.abstractmethod
     def on_boot(self) -> None:
@@ -167,11 +155,11 @@ class CanopenDevice(abc.ABC):
         for k in range(1, _HEARTBEAT_CONSUMERS + 1):
             writable(0x1016, k, Kind.U32, 0)
             # Monitoring starts with the first heartbeat after the configuration.
-            self._objects.on_write(0x1016, k, on_written=self._restart_monitoring)
+            self._objects.entry(0x1016, k).on_written = self._restart_monitoring
         writable(0x1017, 0, Kind.U16, 0)
         add(0x1029, 0, Kind.U8, 1)
-        writable(0x1029, 1, Kind.U8, _LEAVE_OPERATIONAL)
-        self._objects.on_write(0x1029, 1, check=one_of((_LEAVE_OPERATIONAL, _KEEP_STATE)))
+        choices = one_of((_LEAVE_OPERATIONAL, _KEEP_STATE))
+        writable(0x1029, 1, Kind.U8, _LEAVE_OPERATIONAL, check=choices)
 
     def _restart_monitoring(self, consumer: int) -> None:
         self._last_heartbeats.pop(consumer >> 16 & 0x7F, None)

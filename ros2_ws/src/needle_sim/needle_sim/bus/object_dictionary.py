@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 from collections.abc import Callable
+from typing import Any
 
 
 class Abort(enum.IntEnum):
@@ -74,32 +75,28 @@ class StoredObject:
     ----------
     kind : Kind or None
         Type of the number; None for a text.
-    value : int
-        The number; 0 for a text.
+    value, default : int
+        The number, now and after power-up; 0 for a text.
     writable : bool
         Whether a client may write it.
     mappable : bool
         Whether a PDO may contain it.
     text : bytes
         The text; empty for a number.
-    check, on_written : callable, optional
-        Callbacks for writing, see `ObjectDictionary.on_write`.
-    default : int
-        The number after power-up.
+    check : callable, optional
+        Called before a client's value is stored; raises `SdoAbortError` to reject it.
+    on_written : callable, optional
+        Called with the value after it is stored.
     """
 
     kind: Kind | None
     value: int
+    default: int
     writable: bool = False
     mappable: bool = False
     text: bytes = b""
     check: Callable[[int], None] | None = None
     on_written: Callable[[int], None] | None = None
-    default: int = dataclasses.field(init=False)
-
-    def __post_init__(self) -> None:
-        """Store the power-up value."""
-        self.default = self.value
 
 
 class ObjectDictionary:
@@ -107,46 +104,14 @@ class ObjectDictionary:
 
     def __init__(self) -> None:
         self._entries: dict[tuple[int, int], StoredObject] = {}
-        self._indices: set[int] = set()
 
     def add(
-        self,
-        index: int,
-        subindex: int,
-        kind: Kind | None,
-        value: int = 0,
-        *,
-        writable: bool = False,
-        mappable: bool = False,
-        text: bytes = b"",
+        self, index: int, subindex: int, kind: Kind | None, value: int = 0, **attributes: Any
     ) -> None:
         """Add an entry with the attributes of `StoredObject`."""
-        self._entries[index, subindex] = StoredObject(kind, value, writable, mappable, text)
-        self._indices.add(index)
+        self._entries[index, subindex] = StoredObject(kind, value, value, **attributes)
 
-    def on_write(
-        self,
-        index: int,
-        subindex: int,
-        *,
-        check: Callable[[int], None] | None = None,
-        on_written: Callable[[int], None] | None = None,
-    ) -> None:
-        """Set callbacks for writing an entry.
-
-        Parameters
-        ----------
-        index, subindex : int
-            Address of the entry.
-        check : callable, optional
-            Called with the value before it is stored; raises `SdoAbortError` to reject it.
-        on_written : callable, optional
-            Called with the value after it is stored.
-        """
-        entry = self._entries[index, subindex]
-        entry.check, entry.on_written = check, on_written
-
-    def entry(self, index: int, subindex: int) -> StoredObject:
+    def entry(self, index: int, subindex: int = 0) -> StoredObject:
         """Return an entry.
 
         Raises
@@ -156,7 +121,8 @@ class ObjectDictionary:
         """
         entry = self._entries.get((index, subindex))
         if entry is None:
-            raise SdoAbortError(Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT)
+            known = any(index == key[0] for key in self._entries)
+            raise SdoAbortError(Abort.NO_SUBINDEX if known else Abort.NO_OBJECT)
         return entry
 
     def value(self, index: int, subindex: int = 0) -> int:
@@ -210,10 +176,7 @@ class ObjectDictionary:
 
 
 # Command specifiers of the client, in the upper three bits of the first byte.
-_INITIATE_DOWNLOAD = 1
-_INITIATE_UPLOAD = 2
-_UPLOAD_SEGMENT = 3
-_ABORT = 4
+_DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(1, 5)
 _TOGGLE = 0x10
 _SEGMENT = 7
 _EXPEDITED = 4
@@ -230,65 +193,52 @@ class SdoServer:
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
         self._dictionary = dictionary
-        self._key = (0, 0)
-        self._upload: bytes | None = None
+        self._multiplexer = bytes(3)
+        # Data of an upload that are not sent yet.
+        self._rest = b""
         self._toggle = 0
-        self._handlers = {
-            _INITIATE_DOWNLOAD: self._initiate_download,
-            _INITIATE_UPLOAD: self._initiate_upload,
-            _UPLOAD_SEGMENT: self._upload_segment,
-        }
 
     def answer(self, request: bytes) -> bytes | None:
         """Return the answer to a request, or None if it needs none or is not 8 bytes long."""
         if len(request) != 8:
             return None
-        specifier = request[0] >> 5
-        if specifier == _ABORT:
-            self._upload = None
+        if request[0] >> 5 != _UPLOAD_SEGMENT:
+            self._rest = b""
+        if request[0] >> 5 == _ABORT:
             return None
-        if specifier in (_INITIATE_DOWNLOAD, _INITIATE_UPLOAD):
-            self._upload = None
-            self._key = (int.from_bytes(request[1:3], "little"), request[3])
         try:
-            return self._handlers.get(specifier, self._reject)(request)
+            return self._execute(request)
         except SdoAbortError as error:
-            self._upload = None
+            self._rest = b""
             return b"\x80" + self._multiplexer + int(error.code).to_bytes(4, "little")
 
-    def _reject(self, _: bytes) -> bytes:
+    def _execute(self, request: bytes) -> bytes:
+        command, specifier = request[0], request[0] >> 5
+        if specifier == _UPLOAD_SEGMENT and self._rest:
+            return self._next_segment(command)
+        if specifier in (_DOWNLOAD, _UPLOAD):
+            self._multiplexer = request[1:4]
+            key = int.from_bytes(request[1:3], "little"), request[3]
+            if specifier == _UPLOAD:
+                return self._begin_upload(self._dictionary.read(*key))
+            # Writable objects have at most 4 bytes and need no segments.
+            if command & 2:
+                unused = command >> 2 & 3 if command & 1 else 0
+                self._dictionary.write(*key, request[4 : 8 - unused])
+                return b"\x60" + self._multiplexer + bytes(4)
         raise SdoAbortError(Abort.COMMAND)
 
-    @property
-    def _multiplexer(self) -> bytes:
-        index, subindex = self._key
-        return index.to_bytes(2, "little") + bytes([subindex])
-
-    def _initiate_download(self, request: bytes) -> bytes:
-        command = request[0]
-        if not command & 2:
-            # Writable objects have at most 4 bytes and need no segments.
-            raise SdoAbortError(Abort.COMMAND)
-        unused = command >> 2 & 3 if command & 1 else 0
-        self._dictionary.write(*self._key, request[4 : 8 - unused])
-        return b"\x60" + self._multiplexer + bytes(4)
-
-    def _initiate_upload(self, _: bytes) -> bytes:
-        data = self._dictionary.read(*self._key)
+    def _begin_upload(self, data: bytes) -> bytes:
         if len(data) <= _EXPEDITED:
             command = 0x43 | (_EXPEDITED - len(data)) << 2
             return bytes([command]) + self._multiplexer + data.ljust(4, b"\0")
-        self._upload = data
-        self._toggle = 0
+        self._rest, self._toggle = data, 0
         return b"\x41" + self._multiplexer + len(data).to_bytes(4, "little")
 
-    def _upload_segment(self, request: bytes) -> bytes:
-        if self._upload is None:
-            raise SdoAbortError(Abort.COMMAND)
-        if request[0] & _TOGGLE != self._toggle:
+    def _next_segment(self, command: int) -> bytes:
+        if command & _TOGGLE != self._toggle:
             raise SdoAbortError(Abort.TOGGLE)
-        part, rest = self._upload[:_SEGMENT], self._upload[_SEGMENT:]
-        command = self._toggle | (_SEGMENT - len(part)) << 1 | (not rest)
-        self._upload = rest or None
+        part, self._rest = self._rest[:_SEGMENT], self._rest[_SEGMENT:]
+        answer = self._toggle | (_SEGMENT - len(part)) << 1 | (not self._rest)
         self._toggle ^= _TOGGLE
-        return bytes([command]) + part.ljust(_SEGMENT, b"\0")
+        return bytes([answer]) + part.ljust(_SEGMENT, b"\0")

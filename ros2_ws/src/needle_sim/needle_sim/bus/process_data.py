@@ -7,7 +7,7 @@ from functools import partial
 
 from needle_sim.bus.object_dictionary import Abort, Kind, ObjectDictionary, SdoAbortError, one_of
 
-INVALID = 1 << 31
+_INVALID = 1 << 31
 _MOST_ENTRIES = 8
 # Transmission types: with every SYNC, or at once (of the manufacturer or the device profile).
 _EVERY_SYNC = 1
@@ -23,39 +23,39 @@ class _Pdo:
         Object dictionary of the device, which holds the parameters.
     number : int
         Number within its direction, from 0.
-    cob_id : int
-        Identifier after power-up; bit 31 disables the PDO.
-    mapped : tuple of int
-        Mapping after power-up: index << 16 | subindex << 8 | bits.
+    node_id : int
+        Node id of the device. Identifiers are those of the predefined connection set; after
+        power-up, only the first PDO is enabled.
+    default : tuple of int
+        Mapping of the first PDO after power-up: index << 16 | subindex << 8 | bits.
     """
 
-    # For each direction: indices of the first communication and mapping parameters, and further
-    # sub-indices of the former, which only accept 0.
+    # For each direction: identifier of the first PDO, indices of its communication and mapping
+    # parameters, and further sub-indices of the former, which only accept 0.
+    _first_cob_id: int
     _first_parameters: int
     _first_mapping: int
     _unused_parameters: tuple[int, ...] = ()
 
     def __init__(
-        self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
+        self, dictionary: ObjectDictionary, number: int, node_id: int, default: tuple[int, ...]
     ) -> None:
         self._dictionary = dictionary
         self._parameters = parameters = self._first_parameters + number
         self._mapping = mapping = self._first_mapping + number
+        cob_id = self._first_cob_id + 0x100 * number + node_id | (_INVALID if number else 0)
+        mapped = () if number else default
         writable = partial(dictionary.add, writable=True)
         dictionary.add(parameters, 0, Kind.U8, max((2, *self._unused_parameters)))
-        writable(parameters, 1, Kind.U32, cob_id)
-        writable(parameters, 2, Kind.U8, _AT_ONCE[-1])
+        writable(parameters, 1, Kind.U32, cob_id, check=self._check_cob_id)
+        types = one_of((_EVERY_SYNC, *_AT_ONCE))
+        writable(parameters, 2, Kind.U8, _AT_ONCE[-1], check=types)
         for subindex in self._unused_parameters:
-            writable(parameters, subindex, Kind.U16, 0)
-            dictionary.on_write(parameters, subindex, check=one_of((0,)))
-        writable(mapping, 0, Kind.U8, len(mapped))
+            writable(parameters, subindex, Kind.U16, 0, check=one_of((0,)))
+        writable(mapping, 0, Kind.U8, len(mapped), check=self._check_count)
         for entry in range(1, _MOST_ENTRIES + 1):
             value = mapped[entry - 1] if entry <= len(mapped) else 0
-            writable(mapping, entry, Kind.U32, value)
-            dictionary.on_write(mapping, entry, check=self._check_entry)
-        dictionary.on_write(parameters, 1, check=self._check_cob_id)
-        dictionary.on_write(parameters, 2, check=one_of((_EVERY_SYNC, *_AT_ONCE)))
-        dictionary.on_write(mapping, 0, check=self._check_count)
+            writable(mapping, entry, Kind.U32, value, check=self._check_entry)
         # Cached, because they are read at every frame and every tick.
         self._mapping_entries = [dictionary.entry(mapping, k) for k in range(_MOST_ENTRIES + 1)]
         self._cob_id = dictionary.entry(parameters, 1)
@@ -65,7 +65,7 @@ class _Pdo:
     def cob_id(self) -> int | None:
         """Identifier; None while the PDO is disabled."""
         value = self._cob_id.value
-        return None if value & INVALID else value & 0x7FF
+        return None if value & _INVALID else value & 0x7FF
 
     @property
     def _is_synchronous(self) -> bool:
@@ -81,7 +81,7 @@ class _Pdo:
     def _check_cob_id(self, value: int) -> None:
         changed = (value ^ self._dictionary.value(self._parameters, 1)) & 0x1FFFFFFF
         # The identifier may change only while the PDO is disabled.
-        if changed and self.cob_id is not None and not value & INVALID:
+        if changed and self.cob_id is not None and not value & _INVALID:
             raise SdoAbortError(Abort.VALUE_RANGE)
         if value & 0x1FFFF800:
             raise SdoAbortError(Abort.VALUE_RANGE)
@@ -115,7 +115,7 @@ class _Pdo:
 class ReceivePdo(_Pdo):
     """Receives values from the bus; the parameters are those of `_Pdo`."""
 
-    _first_parameters, _first_mapping = 0x1400, 0x1600
+    _first_cob_id, _first_parameters, _first_mapping = 0x200, 0x1400, 0x1600
     _waiting: bytes | None = None
 
     def receive(self, data: bytes) -> None:
@@ -151,7 +151,7 @@ class ReceivePdo(_Pdo):
 class TransmitPdo(_Pdo):
     """Sends values to the bus, with every SYNC or on change; the parameters are those of `_Pdo`."""
 
-    _first_parameters, _first_mapping = 0x1800, 0x1A00
+    _first_cob_id, _first_parameters, _first_mapping = 0x180, 0x1800, 0x1A00
     # Inhibit time and event timer.
     _unused_parameters = (3, 5)
     _sent: bytes | None = None

@@ -13,9 +13,9 @@ DONE = b"\r"
 REFUSED = b"\a"
 _SENT = b"z\r"
 _SENT_EXTENDED = b"Z\r"
-_VERSION = b"V1013\r"
-_SERIAL_NUMBER = b"NSIM1\r"
-_NO_ERRORS = b"F00\r"
+# Time stamps, polling and filters are accepted without effect.
+_ANSWERS = {bytes([kind]): DONE for kind in b"ZXMmQWUY"} | {b"": DONE}
+_ANSWERS |= {b"V": b"V1013\r", b"N": b"NSIM1\r", b"F": b"F00\r"}
 # Bound of the buffer; the longest command is an extended frame of 8 bytes.
 _MAX_COMMAND = 64
 _MAX_DATA = 8
@@ -72,27 +72,16 @@ class SlcanAdapter:
             f"{kind}{frame.identifier:03X}{len(frame.data):d}{frame.data.hex().upper()}\r".encode()
         )
 
-    def _execute(self, command: bytes, frames: list[CanFrame]) -> bytes:  # noqa: PLR0911 - one a kind
+    def _execute(self, command: bytes, frames: list[CanFrame]) -> bytes:
         kind, rest = command[:1], command[1:]
-        if kind == b"":
-            return DONE
-        if kind in b"tTrR":
+        if kind in (b"t", b"T", b"r", b"R"):
             return self._send(kind, rest, frames)
-        if kind == b"O":
-            if self._open or rest:
-                return REFUSED
-            self._open = True
-            return DONE
-        if kind == b"C" and not rest:
-            self._open = False
-            return DONE
-        if kind in b"Ss":
+        if kind in (b"S", b"s"):
             return REFUSED if self._open or not rest else DONE
-        answers = {b"V": _VERSION, b"N": _SERIAL_NUMBER, b"F": _NO_ERRORS}
-        if kind in answers:
-            return answers[kind]
-        # Time stamps, polling and filters are accepted without effect.
-        return DONE if kind in b"ZXMmQWUY" else REFUSED
+        if command == b"C" or (command == b"O" and not self._open):
+            self._open = command == b"O"
+            return DONE
+        return _ANSWERS.get(kind, REFUSED)
 
     def _send(self, kind: bytes, rest: bytes, frames: list[CanFrame]) -> bytes:
         if not self._open:

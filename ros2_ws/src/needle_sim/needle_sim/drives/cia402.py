@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 from functools import partial
 
-from needle_sim.bus.object_dictionary import Kind, ObjectDictionary
+from needle_sim.bus.object_dictionary import Kind, ObjectDictionary, one_of
+from needle_sim.drives.motion_profile import METHODS
+from needle_sim.drives.motor import MotorSettings
 
 
 class PowerState(enum.Enum):
@@ -57,11 +60,8 @@ TRANSITIONS: dict[tuple[PowerState, PowerCommand], PowerState] = {
 
 def decode_command(controlword: int) -> PowerCommand | None:
     """Return the command of a controlword; None if it has none."""
-    for command in PowerCommand:
-        mask, value = command.value
-        if controlword & mask == value:
-            return command
-    return None
+    every = ((command, *command.value) for command in PowerCommand)
+    return next((command for command, mask, value in every if controlword & mask == value), None)
 
 
 def next_state(state: PowerState, controlword: int) -> PowerState:
@@ -82,6 +82,10 @@ ERROR_CODE = 0x603F
 TARGET_POSITION = 0x607A
 POSITION = 0x6064
 MODE = 0x6060
+THEN_OFF, _THEN_HOLD = 2, 6
+"""Quick stop options (0x605A): brake on the ramp, then switch off or hold."""
+AT_ONCE, _ON_RAMP = 0, 1
+"""Options for switching off (0x605B, 0x605C): at once, or after a ramp."""
 STEPPER = 0x0004_0192
 SERVO = 0x0002_0192
 _MANUFACTURER = 0x0000_0000
@@ -89,44 +93,61 @@ _INT32_MIN, _INT32_MAX = Kind.I32.bounds
 _VERSION = b"1.0"
 
 
-def drive_dictionary(
-    name: str, device_type: int, number: int, *, counts_per_unit: float, rpm: float | None
-) -> ObjectDictionary:
-    """Return the object dictionary of a drive.
+@dataclasses.dataclass(frozen=True)
+class EmulatedDriveSettings:
+    """Settings of an emulated drive.
 
-    Parameters
+    Attributes
     ----------
     name : str
-        Name of the axis, part of the device name.
+        Name of the axis.
+    node_id : int
+        Node id, 1..127.
     device_type : int
-        Object 0x1000.
-    number : int
-        Serial number.
-    counts_per_unit : float
-        Scale of the slow speeds and ramps after power-up.
+        Object 0x1000: stepper or servo.
+    motor : MotorSettings
+        Mechanics of the axis.
+    boot_time : float
+        Time from power-up to the boot-up message [s].
     rpm : float or None
-        One rpm of the motor [counts/s], for a drive with speeds in rpm; None: counts/s.
+        One rpm of the motor [counts/s], for a drive with speeds in rpm and ramps in rpm/s.
     """
+
+    name: str
+    node_id: int
+    device_type: int
+    motor: MotorSettings
+    boot_time: float
+    rpm: float | None = None
+
+
+def drive_dictionary(settings: EmulatedDriveSettings) -> ObjectDictionary:
+    """Return the object dictionary of a drive."""
     objects = ObjectDictionary()
     add = objects.add
-    add(0x1000, 0, Kind.U32, device_type)
-    add(0x1008, 0, None, text=f"Emulated {name} drive".encode())
+    add(0x1000, 0, Kind.U32, settings.device_type)
+    add(0x1008, 0, None, text=f"Emulated {settings.name} drive".encode())
     add(0x1009, 0, None, text=_VERSION)
     add(0x100A, 0, None, text=_VERSION)
-    for k, value in enumerate((4, _MANUFACTURER, 0x402, 1, number)):
+    for k, value in enumerate((4, _MANUFACTURER, 0x402, 1, settings.node_id)):
         add(0x1018, k, Kind.U8 if k == 0 else Kind.U32, value)
 
-    slow = max(round(1e-3 * counts_per_unit), 1)
+    slow = max(round(1e-3 * settings.motor.counts_per_unit), 1)
     read_write = partial(add, writable=True)
     in_pdo = partial(add, mappable=True)
     both = partial(add, writable=True, mappable=True)
     in_pdo(ERROR_CODE, 0, Kind.U16)
-    read_write(0x6007, 0, Kind.I16, 1)
     both(CONTROLWORD, 0, Kind.U16)
     in_pdo(STATUSWORD, 0, Kind.U16)
-    for index, option in ((0x605A, 2), (0x605B, 0), (0x605C, 1), (0x605D, 1), (0x605E, 2)):
-        read_write(index, 0, Kind.I16, option)
-    both(MODE, 0, Kind.I8)
+    for index, option, choices in (
+        # A lost connection is a fault, which brakes.
+        *((0x6007, 1, (1,)), (0x605E, 2, (2,))),
+        *((0x605A, THEN_OFF, (THEN_OFF, _THEN_HOLD)), (0x605B, AT_ONCE, (AT_ONCE, _ON_RAMP))),
+        (0x605C, _ON_RAMP, (AT_ONCE, _ON_RAMP)),
+    ):
+        read_write(index, 0, Kind.I16, option, check=one_of(choices))
+    read_write(0x605D, 0, Kind.I16, 1)
+    both(MODE, 0, Kind.I8, check=one_of(MODES))
     in_pdo(0x6061, 0, Kind.I8)
     for index in (0x6062, POSITION, 0x606C, 0x60F4):
         in_pdo(index, 0, Kind.I32)
@@ -145,15 +166,15 @@ def drive_dictionary(
     both(0x6081, 0, Kind.U32, slow)
     for index in (0x6083, 0x6084, 0x6085, 0x609A):
         both(index, 0, Kind.U32, 10 * slow)
-    both(0x6098, 0, Kind.I8, 0)
+    both(0x6098, 0, Kind.I8, 0, check=one_of((0, *METHODS)))
     add(0x6099, 0, Kind.U8, 2)
     both(0x6099, 1, Kind.U32, slow)
     both(0x6099, 2, Kind.U32, max(slow // 10, 1))
     # The codes of CiA 303-2: prefix, numerator, denominator.
     units = [0x00B5_0000, 0x00B5_0300, 0x00B5_5700]
-    if rpm is not None:
+    if settings.rpm is not None:
         units[1:] = 0x00B4_4700, 0x00C0_0300
-        for k, value in enumerate((2, round(60.0 * rpm), 1)):
+        for k, value in enumerate((2, round(60.0 * settings.rpm), 1)):
             add(0x608F, k, Kind.U8 if k == 0 else Kind.U32, value)
     for k, code in enumerate(units):
         add(0x60A8 + k, 0, Kind.U32, code)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 from needle_sim.bus.object_dictionary import ObjectDictionary
 from needle_sim.drives.cia402 import (
+    CONTROLWORD,
     CYCLIC_SYNCHRONOUS_POSITION,
     HOMING,
     POSITION,
@@ -11,7 +14,7 @@ from needle_sim.drives.cia402 import (
     TARGET_POSITION,
 )
 from needle_sim.drives.emulated_drives import MOTION_STEP
-from needle_sim.drives.motion_profile import METHODS, Demand, Homing
+from needle_sim.drives.motion_profile import METHODS, Demand, home
 from needle_sim.drives.motor import Motor
 
 # Mode-specific bits of the controlword and of the statusword.
@@ -22,6 +25,7 @@ _REACHED, _LIMITED, _BIT_12, _BIT_13 = 1 << 10, 1 << 11, 1 << 12, 1 << 13
 # Bits of the digital inputs (0x60FD).
 _NEGATIVE_SWITCH, _POSITIVE_SWITCH, _HOME_SWITCH = 1, 2, 4
 _NO_WINDOW = 0xFFFFFFFF
+_MODE_DISPLAY = 0x6061
 
 
 class DriveMotion:
@@ -45,10 +49,8 @@ class DriveMotion:
         self._motor = motor
         self._demand = Demand(motor.position)
         self._zero = motor.position
-        self._mode = 0
-        self._word = 0
         self._homed = False
-        self._homing: Homing | None = None
+        self._homing: Generator[None, None, float] | None = None
         self._homing_failed = False
         self._target: float | None = None
         self._next_target: float | None = None
@@ -61,7 +63,6 @@ class DriveMotion:
         """Power up: un-homed, and counting from the present position."""
         self.switch_off()
         self._zero = self._motor.position
-        self._mode = self._word = 0
         self._homed = self._homing_failed = self._limited = False
 
     def switch_off(self) -> None:
@@ -80,16 +81,11 @@ class DriveMotion:
     def set_mode(self, mode: int) -> None:
         """Set the mode of operation."""
         if mode != self._mode:
-            self._mode = mode
             self.clear_targets()
-            self._objects.set(0x6061, 0, mode)
+            self._objects.set(_MODE_DISPLAY, 0, mode)
 
-    def apply_controlword(self, word: int, *, enabled: bool) -> None:
-        """Apply the mode-specific bits of the controlword, if operation is enabled."""
-        rising = word & ~self._word
-        self._word = word
-        if not enabled:
-            return
+    def apply_controlword(self, word: int, rising: int) -> None:
+        """Apply the mode-specific bits of a controlword, and those of them that are new."""
         if self._mode == PROFILE_POSITION and rising & NEW_SET_POINT:
             self._start_profile_motion(word)
         elif self._mode == HOMING and rising & HOMING_START:
@@ -146,7 +142,7 @@ class DriveMotion:
             if demand.approach(self._target, speed, *ramps, period):
                 self._target, self._next_target = self._next_target, None
         elif self._homing is not None and not self._halted:
-            self._home(self._homing, period)
+            self._home(self._homing)
         else:
             self.brake(0x6084, period)
 
@@ -198,6 +194,14 @@ class DriveMotion:
         return self._objects.value(index, subindex) * self._speed_unit
 
     @property
+    def _mode(self) -> int:
+        return self._objects.value(_MODE_DISPLAY)
+
+    @property
+    def _word(self) -> int:
+        return self._objects.value(CONTROLWORD)
+
+    @property
     def _halted(self) -> bool:
         return bool(self._word & HALT)
 
@@ -216,18 +220,20 @@ class DriveMotion:
         if self._homing_failed:
             return
         self._homed = self._limited = False
-        self._homing = Homing(
+        self._homing = home(
             value(0x6098),
             self._motor,
+            self._demand,
             speed=self._speed(0x6099, 1),
             edge_speed=self._speed(0x6099, 2),
-            acceleration=self._speed(0x609A),
+            ramp=self._speed(0x609A),
         )
 
-    def _home(self, homing: Homing, period: float) -> None:
-        homing.advance(self._demand, period)
-        if homing.done:
-            self._zero = homing.home_position + self._objects.value(0x607C)
+    def _home(self, homing: Generator[None, None, float]) -> None:
+        try:
+            next(homing)
+        except StopIteration as ended:
+            self._zero = ended.value + self._objects.value(0x607C)
             self._homed = True
             self._homing = None
 

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 
 from needle_core.can_frame import CAN, CanFrame
 from needle_sim.bus.canopen_device import SYNC
-from needle_sim.drives.emulated_drive import EmulatedDrive, EmulatedDriveSettings
+from needle_sim.drives.cia402 import EmulatedDriveSettings
+from needle_sim.drives.emulated_drive import EmulatedDrive
 from needle_sim.drives.emulated_drives import EmulatedDrives
 
 
@@ -35,17 +36,14 @@ class EmulatedBus(EmulatedDrives):
         if not self.is_cut:
             self.advance_to(now)
             for frame in batch:
-                self._receive(frame, now)
+                is_sync = frame.identifier == SYNC and not frame.remote
+                self.syncs += is_sync
+                for drive in self.drives.values():
+                    if is_sync:
+                        drive.sync()
+                    else:
+                        drive.receive(frame, now)
         return self._drain_outboxes()
-
-    def _receive(self, frame: CanFrame, now: float) -> None:
-        if frame.identifier == SYNC and not frame.remote:
-            self.syncs += 1
-            for drive in self.drives.values():
-                drive.sync()
-            return
-        for drive in self.drives.values():
-            drive.receive(frame, now)
 
     def poll(self, now: float) -> list[CanFrame]:
         """Advance the drives to steady time `now` [s]; return the frames that they sent."""

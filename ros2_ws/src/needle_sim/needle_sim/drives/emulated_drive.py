@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from needle_core.can_frame import CanFrame
 from needle_sim.bus.canopen_device import HEARTBEAT_LOST, SDO_REQUEST, CanopenDevice
-from needle_sim.bus.object_dictionary import one_of
 from needle_sim.drives.cia402 import (
+    AT_ONCE,
     CONTROLWORD,
     ERROR_CODE,
     FAULT_RESET,
     MODE,
-    MODES,
     STATUSWORD,
+    THEN_OFF,
+    EmulatedDriveSettings,
     PowerCommand,
     PowerState,
     decode_command,
@@ -22,8 +21,7 @@ from needle_sim.drives.cia402 import (
 )
 from needle_sim.drives.drive_motion import DriveMotion
 from needle_sim.drives.emulated_drives import FAULT, MOTION_STEP
-from needle_sim.drives.motion_profile import METHODS
-from needle_sim.drives.motor import Motor, MotorSettings
+from needle_sim.drives.motor import Motor
 
 FOLLOWING_ERROR = 0x8611
 _MOTION_ERROR = 0x20
@@ -31,46 +29,6 @@ _ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FA
 _VOLTAGE, _REMOTE = 1 << 4, 1 << 9
 # Ramp objects.
 _SLOW_DOWN, _QUICK = 0x6084, 0x6085
-# Quick stop options: on its ramp, then off or hold; options for switching off: at once or a ramp.
-_THEN_OFF, _THEN_HOLD = 2, 6
-_AT_ONCE, _ON_RAMP = 0, 1
-# Supported values of modes and option codes; a lost connection is a fault, which brakes.
-_CHOICES = {
-    0x6007: (1,),
-    0x605A: (_THEN_OFF, _THEN_HOLD),
-    0x605B: (_AT_ONCE, _ON_RAMP),
-    0x605C: (_AT_ONCE, _ON_RAMP),
-    0x605E: (2,),
-    0x6098: (0, *METHODS),
-}
-
-
-@dataclasses.dataclass(frozen=True)
-class EmulatedDriveSettings:
-    """Settings of an emulated drive.
-
-    Attributes
-    ----------
-    name : str
-        Name of the axis.
-    node_id : int
-        Node id, 1..127.
-    device_type : int
-        Object 0x1000: stepper or servo.
-    motor : MotorSettings
-        Mechanics of the axis.
-    boot_time : float
-        Time from power-up to the boot-up message [s].
-    rpm : float or None
-        One rpm of the motor [counts/s], for a drive with speeds in rpm and ramps in rpm/s.
-    """
-
-    name: str
-    node_id: int
-    device_type: int
-    motor: MotorSettings
-    boot_time: float
-    rpm: float | None = None
 
 
 class EmulatedDrive(CanopenDevice):
@@ -85,13 +43,7 @@ class EmulatedDrive(CanopenDevice):
     def __init__(self, settings: EmulatedDriveSettings) -> None:
         self.settings = settings
         self.motor = Motor(settings.motor)
-        objects = drive_dictionary(
-            settings.name,
-            settings.device_type,
-            settings.node_id,
-            counts_per_unit=settings.motor.counts_per_unit,
-            rpm=settings.rpm,
-        )
+        objects = drive_dictionary(settings)
         super().__init__(
             settings.node_id,
             objects,
@@ -100,10 +52,8 @@ class EmulatedDrive(CanopenDevice):
             boot_time=settings.boot_time,
         )
         self._motion = DriveMotion(objects, self.motor, settings.rpm or 1.0)
-        objects.on_write(CONTROLWORD, 0, on_written=self._on_controlword)
-        objects.on_write(MODE, 0, check=one_of(MODES), on_written=self._motion.set_mode)
-        for index, choices in _CHOICES.items():
-            objects.on_write(index, 0, check=one_of(choices))
+        objects.entry(CONTROLWORD).on_written = self._on_controlword
+        objects.entry(MODE).on_written = self._motion.set_mode
         self.state = PowerState.NOT_READY
         # Power state after the present ramp.
         self._pending_state: PowerState | None = None
@@ -201,7 +151,7 @@ class EmulatedDrive(CanopenDevice):
     def _ends_quick_stop(self) -> bool:
         """Whether the drive switches off after its present quick stop."""
         is_active = self.state is PowerState.QUICK_STOP_ACTIVE
-        return is_active and self._objects.value(0x605A) == _THEN_OFF
+        return is_active and self._objects.value(0x605A) == THEN_OFF
 
     # ---- power --------------------------------------------------------------------------------
 
@@ -215,8 +165,8 @@ class EmulatedDrive(CanopenDevice):
                 self.state = PowerState.SWITCH_ON_DISABLED
         elif self._pending_state is None:
             self._change(next_state(self.state, word))
-        enabled = self.state is PowerState.OPERATION_ENABLED and self._pending_state is None
-        self._motion.apply_controlword(word, enabled=enabled)
+        if self.state is PowerState.OPERATION_ENABLED and self._pending_state is None:
+            self._motion.apply_controlword(word, rising)
 
     def _change(self, state: PowerState) -> None:
         before = self.state
@@ -236,7 +186,7 @@ class EmulatedDrive(CanopenDevice):
         if state in _ON or at_once:
             return False
         index = 0x605B if state is PowerState.READY_TO_SWITCH_ON else 0x605C
-        return self._objects.value(index) != _AT_ONCE
+        return self._objects.value(index) != AT_ONCE
 
     def on_boot(self) -> None:
         """Become ready to be switched on."""

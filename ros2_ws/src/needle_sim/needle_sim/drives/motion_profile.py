@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import enum
 import math
+from collections.abc import Callable, Generator, Iterator
+from functools import partial
 
+from needle_sim.drives.emulated_drives import MOTION_STEP
 from needle_sim.drives.motor import Motor
 
 
@@ -104,16 +106,13 @@ CURRENT_POSITION = (35, 37)
 METHODS = (NEGATIVE_SWITCH, POSITIVE_SWITCH, *CURRENT_POSITION)
 
 
-class _Phase(enum.Enum):
-    SEARCH = 1
-    TURN = 2
-    LEAVE = 3
-    STOP = 4
-    DONE = 5
+def home(
+    method: int, motor: Motor, demand: Demand, *, speed: float, edge_speed: float, ramp: float
+) -> Generator[None, None, float]:
+    """Home a motor: methods 17 and 18 (limit switch), 35 and 37 (present position).
 
-
-class Homing:
-    """Homing run: methods 17 and 18 (limit switch), 35 and 37 (present position).
+    Each step of the generator advances the demand by `MOTION_STEP`. After the last one, the demand
+    rests.
 
     Parameters
     ----------
@@ -121,50 +120,41 @@ class Homing:
         One of `METHODS`.
     motor : Motor
         Motor with the switches.
+    demand : Demand
+        Demand of the motor.
     speed : float
         Speed towards the switch, limited by the motor [counts/s].
     edge_speed : float
         Speed away from the switch, whose edge is the home position [counts/s].
-    acceleration : float
-        Acceleration [counts/s^2].
+    ramp : float
+        Acceleration and deceleration [counts/s^2].
+
+    Returns
+    -------
+    float
+        Home position [true counts].
     """
+    if method in CURRENT_POSITION:
+        return motor.position
+    direction = 1.0 if method == POSITIVE_SWITCH else -1.0
+    blocked = partial(motor.is_blocked, direction)
+    run = partial(demand.run, acceleration=ramp, period=MOTION_STEP)
+    brake = partial(demand.brake, ramp, MOTION_STEP)
+    if not blocked():
+        yield from _repeat(lambda: run(direction * min(speed, motor.max_speed)), blocked)
+        yield
+        yield from _repeat(brake, lambda: demand.at_rest)
+        yield
+    yield from _repeat(lambda: run(-direction * edge_speed), lambda: not blocked())
+    yield
+    yield from _repeat(brake, lambda: demand.at_rest)
+    # The drive latched the encoder position at the edge.
+    return motor.travel if direction > 0.0 else 0.0
 
-    def __init__(
-        self, method: int, motor: Motor, *, speed: float, edge_speed: float, acceleration: float
-    ) -> None:
-        self._motor = motor
-        self._speed = min(speed, motor.max_speed)
-        self._edge_speed = edge_speed
-        self._acceleration = acceleration
-        self._direction = 1.0 if method == POSITIVE_SWITCH else -1.0
-        self.home_position = motor.position
-        if method in CURRENT_POSITION:
-            self._phase = _Phase.DONE
-        else:
-            self._phase = _Phase.LEAVE if motor.is_blocked(self._direction) else _Phase.SEARCH
 
-    @property
-    def done(self) -> bool:
-        """Whether the axis rests and `home_position` (true counts) is known."""
-        return self._phase is _Phase.DONE
-
-    def advance(self, demand: Demand, period: float) -> None:
-        """Advance the demand by `period` [s]."""
-        if self._phase is _Phase.SEARCH:
-            demand.run(self._direction * self._speed, self._acceleration, period)
-            if self._motor.is_blocked(self._direction):
-                self._phase = _Phase.TURN
-        elif self._phase is _Phase.TURN:
-            demand.brake(self._acceleration, period)
-            if demand.at_rest:
-                self._phase = _Phase.LEAVE
-        elif self._phase is _Phase.LEAVE:
-            demand.run(-self._direction * self._edge_speed, self._acceleration, period)
-            if not self._motor.is_blocked(self._direction):
-                # The drive latches the encoder position at the edge.
-                self.home_position = self._motor.travel if self._direction > 0.0 else 0.0
-                self._phase = _Phase.STOP
-        elif self._phase is _Phase.STOP:
-            demand.brake(self._acceleration, period)
-            if demand.at_rest:
-                self._phase = _Phase.DONE
+def _repeat(step: Callable[[], None], is_done: Callable[[], bool]) -> Iterator[None]:
+    """Repeat a step, once per iteration, until a condition holds after it."""
+    step()
+    while not is_done():
+        yield
+        step()

@@ -1,4 +1,4 @@
-"""Torsion of the needle in tissue, and noise of the measured tip."""
+"""Torsion of the needle in tissue."""
 
 from __future__ import annotations
 
@@ -90,33 +90,6 @@ class Torsion:
         mean_decay = np.where(ramp > 0.0, -np.expm1(-ramp) / np.where(ramp > 0.0, ramp, 1.0), 1.0)
         tip = tip + change * (1.0 - mean_decay)
         return np.where(self._lag_length > 0.0, tip, self._play_output)
-
-
-def measured_tip(tip: ArrayLike, amplitude: float, rng: np.random.Generator) -> FloatArray:
-    """Return a tip position with the uniform noise of [KC09] section IV on each coordinate.
-
-    Parameters
-    ----------
-    tip : array_like, shape (..., 3)
-        True position of the tip, in `rig` [m].
-    amplitude : float
-        Maximum error of a coordinate [m].
-    rng : numpy.random.Generator
-        Source of the noise.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        Position in `rig` [m].
-
-    Raises
-    ------
-    ValueError
-        If `amplitude` is negative or not finite.
-    """
-    tip = np.asarray(tip, dtype=np.float64)
-    bound = float(_not_negative("amplitude", amplitude))
-    return tip + rng.uniform(-bound, bound, tip.shape)
 
 
 def _not_negative(name: str, value: ArrayLike) -> FloatArray:

@@ -139,8 +139,6 @@ def _entry(seed: int, path: RandomPath) -> FloatArray:
 
 def _shape(appearance: Appearance) -> NeedleShape:
     """Return the shape of the needle, with or without a bend."""
-    if appearance.lean == 0.0:
-        return NeedleShape(diameter=appearance.diameter, bend_angle=0.0, lean=0.0)
     # Half of the bend tilts the end to one side of the path, the other half the shaft.
     return NeedleShape(
         diameter=appearance.diameter, bend_angle=2.0 * appearance.lean, lean=appearance.lean

@@ -121,10 +121,13 @@ class PathTracer:
     ----------
     mitsuba : Mitsuba
         Result of `load_mitsuba`.
+    rig : StereoRig
+        Rig with the phantom.
     """
 
-    def __init__(self, mitsuba: Mitsuba) -> None:
+    def __init__(self, mitsuba: Mitsuba, rig: StereoRig) -> None:
         self._mi, self._dr = mitsuba
+        self._rig = rig
         self._integrator = self._mi.load_dict({"type": "path", "max_depth": _DEPTH})
 
     def layer(
@@ -132,7 +135,6 @@ class PathTracer:
         scene: Scene,
         pixels: PixelArray,
         camera: SimulatedCamera,
-        rig: StereoRig,
         *,
         samples: int,
         key: list[int],
@@ -147,8 +149,6 @@ class PathTracer:
             u, v of the pixels [px].
         camera : SimulatedCamera
             Camera of the view.
-        rig : StereoRig
-            Rig with the phantom.
         samples : int
             Number of paths per pixel, uniform over its area.
         key : list of int
@@ -164,7 +164,7 @@ class PathTracer:
             Length of these paths, averaged over all paths: distance times `cover` [m].
         """
         parts = [
-            self._part(scene, part, camera, rig, samples=samples, key=[*key, number])
+            self._part(scene, part, camera, samples=samples, key=[*key, number])
             for number, part in enumerate(
                 np.array_split(pixels, max(1, -(-len(pixels) * samples // _MAX_PATHS)))
             )
@@ -176,11 +176,11 @@ class PathTracer:
         return light, cover, distance
 
     def covered(
-        self, scene: Scene, pixels: PixelArray, camera: SimulatedCamera, rig: StereoRig
+        self, scene: Scene, pixels: PixelArray, camera: SimulatedCamera
     ) -> NDArray[np.bool_]:
         """Return whether each pixel, (N, 2), shows an object in front of the floor."""
         mi = self._mi
-        rays = refracted_rays(pixels, camera, rig)
+        rays = refracted_rays(pixels, camera, self._rig)
         origin = mi.Point3f(*(MM * rays.origin.T).astype(np.float32))
         direction = mi.Vector3f(*rays.direction.T.astype(np.float32))
         hit = scene.tracer.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=True)
@@ -234,7 +234,6 @@ class PathTracer:
         scene: Scene,
         pixels: PixelArray,
         camera: SimulatedCamera,
-        rig: StereoRig,
         *,
         samples: int,
         key: list[int],
@@ -244,10 +243,9 @@ class PathTracer:
         index = self._index(len(pixels), samples)
         # Origin and direction are practically linear within a pixel.
         half = np.array([[0.5, 0.0], [0.0, 0.5]])
-        middle = refracted_rays(pixels, camera, rig)
-        right, left, down, up = (
-            refracted_rays(pixels + shift, camera, rig)
-            for shift in (half[0], -half[0], half[1], -half[1])
+        middle, right, left, down, up = (
+            refracted_rays(pixels + shift, camera, self._rig)
+            for shift in (np.zeros(2), half[0], -half[0], half[1], -half[1])
         )
         place = sampler.next_2d() - 0.5
         origin = (

@@ -119,7 +119,7 @@ class PathTracedRenderer:
     def __init__(self, mitsuba: Mitsuba, rig: StereoRig, appearance: Appearance) -> None:
         self._mitsuba, self._rig, self._look = mitsuba, rig, appearance
         self._world = make_world(rig, appearance)
-        self._tracer = PathTracer(mitsuba)
+        self._tracer = PathTracer(mitsuba, rig)
         self._static_scene = Scene(mitsuba, self._world)
         self._needle_scene: Scene | None = None
         self._current_needle: NeedleMesh | None = None
@@ -220,7 +220,7 @@ class PathTracedRenderer:
         """Set light and cover of pixels, (N, 2), that show objects in front of the backdrop."""
         there = (pixels[:, 1], pixels[:, 0])
         radiance, covered, distance = self._tracer.layer(
-            scene, pixels, view.optics.camera, self._rig, samples=samples, key=key
+            scene, pixels, view.optics.camera, samples=samples, key=key
         )
         path_share = distance / np.maximum(covered, 1e-9) / view.backdrop.gel
         clear = _transmission(self._look.haze, path_share)
@@ -258,11 +258,9 @@ class PathTracedRenderer:
         Marks(self._world).draw(floor, optics, 0.4 * float(np.median(self._light[behind])) + veil)
 
         view = dataclasses.replace(view, veil=veil, floor=floor)
-        found = self._tracer.covered(
-            self._static_scene, pixels.reshape(-1, 2), camera, rig
-        ).reshape(size)
+        found = self._tracer.covered(self._static_scene, pixels.reshape(-1, 2), camera)
         around = np.ones((2 * _MARGIN_PX + 1,) * 2, dtype=np.uint8)
-        near = cv2.dilate(found.astype(np.uint8), around) > 0
+        near = cv2.dilate(found.reshape(size).astype(np.uint8), around) > 0
         self._trace(
             view,
             self._static_scene,

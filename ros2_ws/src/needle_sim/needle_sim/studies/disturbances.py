@@ -14,7 +14,6 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
-from needle_core.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
 
 START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE, BUMP, TARGET, DRIFT, BREATH = range(10)
@@ -52,6 +51,11 @@ def uniform_numbers(
     bits = np.random.Philox(key=seed, counter=[block, step, purpose, 0])
     rows = np.random.Generator(bits).random((count + skip, PER_NEEDLE), dtype=np.float32)
     return rows[skip:]
+
+
+def within_one(numbers: NDArray[np.float32]) -> FloatArray:
+    """Return numbers, uniform in [-1, 1), from uniform ones in [0, 1)."""
+    return np.asarray(2.0 * numbers.astype(np.float64) - 1.0)
 
 
 def quantile_levels(numbers: NDArray[np.float32]) -> FloatArray:
@@ -179,18 +183,16 @@ def measured(
         The measured tips [m]; NaN where missing.
     """
     count = len(tips)
-    noisy = np.empty((count, 3))
     if disturbances.noise_shape == "normal":
-        lasting = disturbances.noise_lasting
-        noisy[:] = tips + disturbances.noise * _normal_errors(lasting, seed, exposure, first, count)
+        errors = _normal_errors(disturbances.noise_lasting, seed, exposure, first, count)
     else:
-        share = uniform_numbers(seed, NOISE, exposure, first, count)
+        numbers = uniform_numbers(seed, NOISE, exposure, first, count)[:, :3]
         if disturbances.noise_shape == "student":
-            level = quantile_levels(share[:, :3])
+            level = quantile_levels(numbers)
             errors = scipy.special.stdtrit(disturbances.degrees_of_freedom, level)
-            noisy[:] = tips + disturbances.noise * errors
         else:
-            _add_noise(tips, share, disturbances.noise, noisy)
+            errors = within_one(numbers)
+    noisy = tips + disturbances.noise * errors
     if exposure == 0:
         return noisy
     if disturbances.outliers > 0.0:
@@ -205,8 +207,8 @@ def measured(
 
 def patch_factors(patches: float, seed: int, patch: int, first: int, count: int) -> FloatArray:
     """Return the factor of each needle's curvature in one patch, (count,), within 1 +- patches."""
-    share = uniform_numbers(seed, CURVATURE, patch, first, count)[:, 0]
-    return np.asarray(1.0 + patches * (2.0 * share.astype(np.float64) - 1.0))
+    numbers = uniform_numbers(seed, CURVATURE, patch, first, count)[:, 0]
+    return np.asarray(1.0 + patches * within_one(numbers))
 
 
 def bumps(distance: float, seed: int, first: int, count: int) -> FloatArray:
@@ -247,8 +249,8 @@ class BiasWalk:
     def __init__(self, largest: float, seed: int, first: int, count: int) -> None:
         self._largest = largest
         self._key = seed, first, count
-        share = uniform_numbers(seed, BIAS, 0, first, count)[:, :3]
-        self._bias: FloatArray = largest * (2.0 * share.astype(np.float64) - 1.0)
+        numbers = uniform_numbers(seed, BIAS, 0, first, count)[:, :3]
+        self._bias: FloatArray = largest * within_one(numbers)
 
     def at(self, exposure: int) -> FloatArray:
         """Return the bias of an exposure, (count, 3) [m]; call it for 0, 1, 2 and so on."""
@@ -301,15 +303,6 @@ class DelayLine:
             return np.full_like(tips, np.nan), none
         late, then = self._pending.popleft()
         return late, insertion - then
-
-
-@compiled
-def _add_noise(
-    tips: FloatArray, share: NDArray[np.float32], amplitude: float, noisy: FloatArray
-) -> None:
-    for i in range(tips.shape[0]):
-        for j in range(3):
-            noisy[i, j] = tips[i, j] + amplitude * (2.0 * share[i, j] - 1.0)
 
 
 def _normal_errors(lasting: float, seed: int, exposure: int, first: int, count: int) -> FloatArray:

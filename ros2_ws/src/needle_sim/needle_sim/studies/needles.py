@@ -264,9 +264,11 @@ class DisturbedNeedles:
         self._hidden_delay = DelayLine(wrong.hidden_delay)
         self._delay = DelayLine(wrong.delay)
 
-    def measure_first(self) -> FloatArray:
-        """Return the tips measured before the first motion, (N, 3) [m]."""
-        return self._measured()
+    def measured(self) -> FloatArray:
+        """Return the tips measured at the present exposure, (N, 3) [m]."""
+        seed, first = self._key
+        tips = measured(self.true.tips, self._disturbances, seed, self._exposure, first)
+        return tips + self._bias.at(self._exposure) if self._disturbances.bias_walk else tips
 
     def insert(self, begin: float, end: float, length: ArrayLike, turned: FloatArray) -> None:
         """Move the stages from one insertion to another.
@@ -322,11 +324,5 @@ class DisturbedNeedles:
             Insertion since the measurement, as given to the controller [m].
         """
         self._exposure += 1
-        tips = self._measured()
-        as_new, _ = self._hidden_delay.push(tips, insertion)
+        as_new, _ = self._hidden_delay.push(self.measured(), insertion)
         return self._delay.push(as_new, insertion)
-
-    def _measured(self) -> FloatArray:
-        seed, first = self._key
-        tips = measured(self.true.tips, self._disturbances, seed, self._exposure, first)
-        return tips + self._bias.at(self._exposure) if self._disturbances.bias_walk else tips

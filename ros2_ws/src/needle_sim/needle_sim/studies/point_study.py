@@ -220,7 +220,7 @@ def _steer(
 ) -> PointOutcomes:
     count, true = len(targets.places), needles.true
     controller.set_targets(0.0, targets.at(0.0))
-    rate = controller.start(needles.measure_first())
+    rate = controller.start(needles.measured())
     inserted, rotation, error = np.zeros(count), np.zeros(count), np.full(count, np.nan)
     inside, missed = np.full((2, count), np.nan), np.full(count, np.nan)
     is_moving = np.ones(count, dtype=bool)

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.disturbances import START, Disturbances, uniform_numbers
+from needle_sim.studies.disturbances import START, Disturbances, uniform_numbers, within_one
 from needle_sim.studies.figures_of_merit import Belief, Outcomes, Tally, concatenate
 from needle_sim.studies.needles import DisturbedNeedles
 
@@ -32,34 +32,29 @@ class StartBounds:
         return np.array([self.x, self.pitch, self.roll])
 
 
-def endpoint_grid(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
-    """Return the 10 x 10 x 10 grid whose outermost points are the bounds."""
-    return _grid(np.linspace(-1.0, 1.0, POINTS), bounds, draws)
+def _grid(unit: FloatArray) -> Callable[[StartBounds, int, int], FloatArray]:
+    """Return the function of a 10 x 10 x 10 grid, with coordinates as shares of the bounds."""
 
+    def starts(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
+        points = np.stack(np.meshgrid(unit, unit, unit, indexing="ij"), axis=-1).reshape(-1, 3)
+        return np.repeat(points * bounds.half_widths, draws, axis=0)
 
-def cell_grid(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
-    """Return the centres of the 10 x 10 x 10 cells within the bounds."""
-    return _grid((2.0 * np.arange(POINTS) + 1.0) / POINTS - 1.0, bounds, draws)
+    return starts
 
 
 def random_starts(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
     """Return random starts, uniform within the bounds, as many as the grids have runs."""
-    numbers = uniform_numbers(seed, START, 0, 0, POINTS**3 * draws)
-    share = numbers[:, :3].astype(np.float64)
-    return np.asarray((2.0 * share - 1.0) * bounds.half_widths)
+    numbers = uniform_numbers(seed, START, 0, 0, POINTS**3 * draws)[:, :3]
+    return within_one(numbers) * bounds.half_widths
 
 
 GRIDS: Mapping[str, Callable[[StartBounds, int, int], FloatArray]] = {
-    "endpoint": endpoint_grid,
-    "cell": cell_grid,
+    # The outermost points of one grid are the bounds; the other one has cells within them.
+    "endpoint": _grid(np.linspace(-1.0, 1.0, POINTS)),
+    "cell": _grid((2.0 * np.arange(POINTS) + 1.0) / POINTS - 1.0),
     "random": random_starts,
 }
 """Functions of bounds, draws and seed; they return x [m], pitch, roll [rad], (1000 draws, 3)."""
-
-
-def _grid(unit: FloatArray, bounds: StartBounds, draws: int) -> FloatArray:
-    points = np.stack(np.meshgrid(unit, unit, unit, indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.repeat(points * bounds.half_widths, draws, axis=0)
 
 
 CHUNK = 500
@@ -206,7 +201,7 @@ def _steer(
 ) -> Outcomes:
     steps, true = settings.steps, needles.true
     tally = Tally(true.x, steps)
-    rate = controller.start(needles.measure_first())
+    rate = controller.start(needles.measured())
     insertion = 0.0
     for step in range(1, steps + 1):
         reached = min(step * settings.step_length, settings.depth)

@@ -9,9 +9,8 @@ from typing import Any
 import canopen
 
 from needle_core.can_frame import CanFrame
-from needle_sim.drives.cia402 import SERVO, STEPPER
+from needle_sim.drives.cia402 import SERVO, STEPPER, EmulatedDriveSettings
 from needle_sim.drives.emulated_bus import EmulatedBus
-from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
 
 INSERTION, ROTATION, MASTER = 1, 2, 127

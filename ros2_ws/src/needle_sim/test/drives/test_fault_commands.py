@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -71,6 +72,8 @@ def test_lines_that_are_no_commands_are_named_and_do_nothing(drives: DriveEmulat
 
 
 def test_invalid_drive_settings_are_rejected() -> None:
-    for bad in ({"insertion_node_id": 2}, {"insertion_start": 0.3}):
-        with pytest.raises(UserError, match=r"node id|beyond"):
+    unknown = ({"drives": names} for names in ("gallil", "cia402,", "cia402,cia402,cia402"))
+    bad: Any
+    for bad in ({"insertion_node_id": 2}, {"insertion_start": 0.3}, *unknown):
+        with pytest.raises(UserError, match=r"node id|beyond|is unknown; known: cia402|at most 2"):
             DriveEmulator(DriveEmulatorParameters(**bad))

@@ -120,12 +120,6 @@ def test_each_axis_has_the_drives_of_its_name() -> None:
     assert list(both.motors) == ["insertion", "rotation"]
 
 
-@pytest.mark.parametrize("drives", ["gallil", "cia402,", "cia402,cia402,cia402"])
-def test_unknown_drives_are_an_error(drives: str) -> None:
-    with pytest.raises(UserError, match=r"is unknown; known: cia402|at most 2"):
-        DriveEmulator(DriveEmulatorParameters(drives=drives))
-
-
 # ---- the TCP server ---------------------------------------------------------------------------
 
 

@@ -1,4 +1,4 @@
-"""Torsion: dead band and lag, compared with their definitions. Noise: its bounds."""
+"""Torsion: dead band and lag, compared with their definitions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from needle_sim.needle.tissue import Torsion, measured_tip
+from needle_sim.needle.tissue import Torsion
 
 
 def test_the_tip_stays_inside_the_dead_band_and_follows_at_its_distance_both_ways() -> None:
@@ -40,19 +40,7 @@ def test_the_lag_follows_its_differential_equation_both_ways() -> None:
         assert float(torsion.tip_angle) == pytest.approx(tip, abs=1e-8)
 
 
-def test_noise_is_uniform_within_its_bound_and_keyed() -> None:
-    tips = np.tile([0.001, 0.002, 0.05], (5_000, 1))
-    error = measured_tip(tips, 0.001, np.random.default_rng(7)) - tips
-    assert np.abs(error).max() <= 0.001 + 1e-15
-    np.testing.assert_allclose(error.std(axis=0), 0.001 / np.sqrt(3.0), rtol=0.03)
-    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=3e-5)
-    again = measured_tip(tips, 0.001, np.random.default_rng(7)) - tips
-    np.testing.assert_array_equal(again, error)
-
-
 def test_bad_figures_are_refused() -> None:
     for bad in ({"play": -0.1}, {"lag_length": np.nan}, {"play": [0.0, np.inf]}):
         with pytest.raises(ValueError, match="must be finite and not negative"):
             Torsion(**bad)
-    with pytest.raises(ValueError, match="amplitude"):
-        measured_tip(np.zeros(3), -0.001, np.random.default_rng(7))

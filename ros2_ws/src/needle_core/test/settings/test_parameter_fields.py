@@ -1,4 +1,4 @@
-"""The check of bounds for all numbers of the user."""
+"""Parameters of a node: their types, bounds and choices, and their table."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import math
 
 import pytest
 
-from needle_core.errors import OutOfBoundsError, UserError
-from needle_core.settings.bounds import ABOVE_0, check_bounds
+from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import (
     check_fields,
     describe,
@@ -16,20 +15,6 @@ from needle_core.settings.parameter_fields import (
     from_values,
     parameter,
 )
-
-
-def test_a_value_out_of_bounds_is_reported_with_its_bounds() -> None:
-    check_bounds("width", 0.0, 0.0, 1.0, "m")
-    check_bounds("noise", 5.0, ABOVE_0, 5.0, "m")
-    for value, text in ((0.0, "0"), (5.1, "5.1"), (2147483648.0, "2147483648"), (1e30, r"1e\+30")):
-        with pytest.raises(OutOfBoundsError, match=rf"noise = {text} m is outside .*, 5\] m"):
-            check_bounds("noise", value, ABOVE_0, 5.0, "m")
-
-
-def test_nan_and_infinities_are_rejected() -> None:
-    for value in (math.nan, math.inf, -math.inf):
-        with pytest.raises(UserError, match=f"width = {value} m is not finite"):
-            check_bounds("width", value, ABOVE_0, math.inf, "m")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +35,10 @@ def test_parameters_are_applied_with_their_types_or_rejected_with_the_node() -> 
     assert from_values(Parameters, values, "/rig") == Parameters(100.0, 1, (0.0, 9.0), "pid")
     for wrong, cause in (
         ({"rate": 100.1}, "rate = 100.1 Hz is outside [1, 100] Hz"),
+        ({"rate": math.nan}, "rate = nan Hz is not finite"),
+        ({"rate": math.inf}, "rate = inf Hz is not finite"),
+        ({"rate": 1e30}, "rate = 1e+30 Hz is outside [1, 100] Hz"),
+        ({"count": 2147483648}, "count = 2147483648 is outside [1, 9]"),
         ({"rate": 50}, "rate = 50 is not of type float (write 50.0)"),
         ({"count": True}, "count = True is of type bool, expected int"),
         ({"gains": [1.0, -0.1]}, "gains = -0.1 is outside [0, 9]"),
