@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from needle_bringup.studies.study_controllers import controller_factory
-from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import PAPER_NOISE, PRESETS, SteeringSettings
 from needle_controller.protocol.plane_control import PlaneControl
 from needle_sim.camera.insertions import render_insertion
@@ -33,7 +32,7 @@ CALIBRATION = (
 def controllers() -> None:
     """Compile each preset as used in the node and in a study."""
     for preset in PRESETS:
-        PlaneControl(SteeringSettings(preset=preset, **PAPER_NOISE), offset_plane(0.003))
+        PlaneControl(SteeringSettings(preset=preset, target_offset=0.003, **PAPER_NOISE))
         settings = StudySettings(
             curvature=SteeringSettings.curvature,
             depth=0.003,

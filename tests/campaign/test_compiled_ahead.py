@@ -11,7 +11,6 @@ NEVER_COMPILED = """
 import sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
@@ -21,7 +20,7 @@ def compiled():
     found = [one for names in every for one in names.values() if isinstance(one, Dispatcher)]
     return {f"{one.py_func.__module__}.{one.__name__}": len(one.signatures) for one in found}
 
-control = PlaneControl(SteeringSettings(preset=sys.argv[1], **PAPER_NOISE), offset_plane(0.003))
+control = PlaneControl(SteeringSettings(preset=sys.argv[1], target_offset=0.003, **PAPER_NOISE))
 ahead = compiled()
 for step in range(20):
     joints = JointSample(step, step * 0.001, 0.1 * step)

@@ -15,7 +15,6 @@ from figure_rows import Row
 from needle_bringup.studies.study_controllers import controller_factory, needles_at_a_time
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.model.reachability import reachability
-from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
@@ -149,7 +148,7 @@ def _study_one_by_one(name: str) -> float:
 
 def _tips_of_a_run(preset: str) -> list[tuple[FloatArray, JointSample]]:
     """Return the tips and joint positions of a closed-loop run."""
-    control = PlaneControl(dataclasses.replace(SETTINGS, preset=preset), offset_plane(0.003))
+    control = PlaneControl(dataclasses.replace(SETTINGS, preset=preset, target_offset=0.003))
     needle = NeedleBatch(np.array([[0.0, np.deg2rad(2.0), np.deg2rad(15.0)]]))
     length, rotation = SETTINGS.step_length, 0.0
     taken = []
@@ -164,7 +163,7 @@ def _tips_of_a_run(preset: str) -> list[tuple[FloatArray, JointSample]]:
 
 
 def _update_all(preset: str, taken: Sequence[tuple[FloatArray, JointSample]]) -> None:
-    control = PlaneControl(dataclasses.replace(SETTINGS, preset=preset), offset_plane(0.003))
+    control = PlaneControl(dataclasses.replace(SETTINGS, preset=preset, target_offset=0.003))
     for tip, joints in taken:
         estimate = control.update(tip, joints).estimate
         estimate.covariance  # noqa: B018 - lazy, and published

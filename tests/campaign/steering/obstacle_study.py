@@ -16,7 +16,6 @@ import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, clearance, make_scene
 from campaign.steering.path_search import find_path
-from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import next_step
 from needle_controller.protocol.joint_history import JointSample
@@ -108,7 +107,7 @@ def steer(
         List to which the CPU time of each update is appended [s].
     """
     obstacles = tuple(float(value) for value in scene.obstacles.ravel())
-    control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
+    control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles))
     control.target_point = scene.target
     if control.path_problem(0.0):
         # The node would not start.

@@ -22,7 +22,7 @@ _LOG_LENGTH = 100
 _LOGGED = re.compile(r"(\S+) (\d{1,19})")
 
 
-def controller_status(steering: Steering, preset: str, source: str = "") -> ControllerStatus:
+def controller_status(steering: Steering, source: str) -> ControllerStatus:
     """Return the status of the protocol; `source` is the node's name."""
     reach, control, tips = steering.reach, steering.control, steering.tips
     confidence = steering.confidence
@@ -56,7 +56,7 @@ def controller_status(steering: Steering, preset: str, source: str = "") -> Cont
         tips_rejected=tips.rejected.total(),
         tips_rejected_for=", ".join(f"{fault.value} {n}" for fault, n in tips.rejected.items()),
         watchdog_trips=steering.watchdog_trips,
-        preset=preset,
+        preset=steering.settings.preset,
         depth_m=steering.settings.depth,
     )
 

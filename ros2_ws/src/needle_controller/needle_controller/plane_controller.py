@@ -279,7 +279,7 @@ class PlaneController(Component):
             for topic in _CHECKED:
                 values = counts if topic == "joint_states" else {}
                 yield Diagnose(topic, _health(problems.get(topic, ""), values))
-        status = controller_status(self.steering, self.settings.preset, self.name)
+        status = controller_status(self.steering, self.name)
         if status != self._published or self._received.is_full:
             self._published = status
             yield Diagnose("steering", status.diagnostic)

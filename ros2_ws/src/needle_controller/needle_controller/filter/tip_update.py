@@ -94,12 +94,8 @@ def new_reading() -> Reading:
 def prepare_reading(reading: Reading) -> bool:
     """Compute directions, values and bounds; return whether tip and covariance are finite."""
     tip, covariance = reading.tip, reading.covariance
-    for i in range(3):
-        if not math.isfinite(tip[i]):
-            return False
-        for j in range(3):
-            if not math.isfinite(covariance[i, j]):
-                return False
+    if not math.isfinite(tip.sum() + covariance.sum()):
+        return False
     d0 = max(covariance[0, 0], SMALLEST_VARIANCE)
     l10, l20 = covariance[1, 0] / d0, covariance[2, 0] / d0
     d1 = max(covariance[1, 1] - l10 * l10 * d0, SMALLEST_VARIANCE)

@@ -25,7 +25,7 @@ from needle_controller.laws.point_turns import (
     mean_slack,
     write_need,
 )
-from needle_controller.laws.roll_law import allowed_turn, base_turn, heaviest, hypotheses_of
+from needle_controller.laws.roll_law import allowed_turn, base_turn, hypotheses_of
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import ROLL
@@ -120,7 +120,7 @@ def point_turn(
     std = math.sqrt(max(variance, 0.0))
     slack = mean_slack(torsions, settings.max_rotation_per_length)
     needed_turn = desired_turn(need, arc_length, curvature, std, slack, rotation_left, settings)
-    least = settings.smallest_weight * heaviest(torsions)
+    least = settings.smallest_weight * torsions["weight"].max()
     turns = weights = 0.0
     for k in range(torsions.size):
         t = torsions[k]

@@ -177,7 +177,7 @@ def roll_turn(
         Settings of the law.
     """
     limit = settings.max_rotation_per_length * settings.step_length
-    least = settings.smallest_weight * heaviest(torsions)
+    least = settings.smallest_weight * torsions["weight"].max()
     turns = weights = s3_mean = 0.0
     for k in range(torsions.size):
         t = torsions[k]
@@ -194,15 +194,6 @@ def roll_turn(
         s3_mean += t.weight * s3
         weights += t.weight
     return min(max(turns / weights, -limit), limit), s3_mean / weights
-
-
-@compiled
-def heaviest(torsions: Records) -> float:
-    """Return the largest weight."""
-    largest = 0.0
-    for k in range(torsions.size):
-        largest = max(largest, torsions[k].weight)
-    return largest
 
 
 @compiled
@@ -269,12 +260,10 @@ def nearest_turn(
     """
     upright = math.asin(sine)
     best = cheapest = math.inf
-    for side in range(2):
-        if bend_sign > 0.0 and side == 1:
+    for side in (1.0, -1.0):
+        if side * bend_sign < 0.0:
             continue
-        if bend_sign < 0.0 and side == 0:
-            continue
-        desired = upright if side == 0 else math.pi - upright
+        desired = upright if side > 0.0 else math.pi - upright
         turn, cost = allowed_turn(desired - roll, wound, max_winding)
         if cost < cheapest:
             best, cheapest = turn, cost
@@ -292,11 +281,9 @@ def allowed_turn(turn: float, wound: float, max_winding: float) -> tuple[float, 
     wound, max_winding : float
         See `nearest_turn`.
     """
-    candidate = (turn + math.pi) % (2.0 * math.pi) - math.pi
+    shorter = (turn + math.pi) % (2.0 * math.pi) - math.pi
     best = cheapest = math.inf
-    for k in range(2):
-        if k == 1:
-            candidate -= math.copysign(2.0 * math.pi, candidate)
+    for candidate in (shorter, shorter - math.copysign(2.0 * math.pi, shorter)):
         cost = abs(candidate)
         over = abs(wound + candidate) - max_winding
         if over > 0.0:

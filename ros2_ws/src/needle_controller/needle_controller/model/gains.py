@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
-from needle_controller.model.feedback_linearization import A, C, transition
+from needle_controller.model.feedback_linearization import transition
 from needle_core.compiled import compiled
 from needle_core.errors import UserError
 
@@ -30,14 +30,11 @@ class Gains:
     ----------
     feedback : ndarray, shape (3,)
         K of (10): (1/m^3, 1/m^2, 1/m).
-    observer : ndarray, shape (3,)
-        L of (9) per inserted length: (1/m, 1/m^2, 1/m^3).
     observer_poles : ndarray of complex, shape (3,)
-        Eigenvalues of A - L C [1/m].
+        Eigenvalues of A - L C, L of (9) [1/m].
     """
 
     feedback: Array
-    observer: Array
     observer_poles: npt.NDArray[np.complex128]
 
 
@@ -68,7 +65,7 @@ def design_gains(
     Returns
     -------
     Gains
-        Both gains and the observer's poles.
+        The law's gain and the observer's poles.
 
     Raises
     ------
@@ -80,10 +77,10 @@ def design_gains(
     # K, for the cost s^T weights s + input_weight v^2
     weights = np.array(state_weights) / input_weight
     feedback = np.real(np.poly(_optimal_poles(weights, "state_weights, input_weight")))[:0:-1]
-    # L, the steady Kalman gain: the dual problem has the states of the chain in reverse. One
-    # measurement every step_length is equivalent to white noise of this density.
+    # Poles with the steady Kalman gain: the dual problem has the states of the chain in reverse.
+    # One measurement every step_length is equivalent to white noise of this density.
     noise = np.array(process_noise)[::-1] / (measurement_std**2 * step_length)
-    observer = np.real(np.poly(_optimal_poles(noise, "process_noise, measurement_std")))[1:]
+    observer_poles = _optimal_poles(noise, "process_noise, measurement_std")
     sampled = (
         transition(step_length) - held_input_response(step_length)[:, None] @ feedback[None, :]
     )
@@ -93,8 +90,7 @@ def design_gains(
             f"the law is unstable when held over step_length = {step_length:g} m "
             f"(spectral radius {radius:.3g}, must be < 1): lower state_weights or step_length"
         )
-    poles = np.linalg.eigvals(A - observer[:, None] @ C).astype(complex)
-    return Gains(feedback, observer, poles)
+    return Gains(feedback, observer_poles)
 
 
 def held_input_response(length: float) -> Array:

@@ -78,8 +78,8 @@ def _fill(goal: Array, curvature: float, capsules: Array, tolerance: float) -> b
             for j in range(size):
                 cell[0] = slope[0] * cell[2] + (i - middle) * _CELL
                 cell[1] = slope[1] * cell[2] + (j - middle) * _CELL
-                arrival = _reach_bend(_distance(_ENTRY, cell), curvature)
-                ahead = _goal_bend(_distance(cell, goal), curvature, tolerance)
+                arrival = _largest_bend(_distance(_ENTRY, cell), _UNCERTAIN, curvature)
+                ahead = _largest_bend(_distance(cell, goal), tolerance + _UNCERTAIN, curvature)
                 if math.atan2(math.hypot(cell[0], cell[1]), cell[2]) > arrival:
                     continue
                 if _corner(_ENTRY, cell, goal) > arrival + ahead:
@@ -118,8 +118,8 @@ def _is_entered(
             first[0] = goal[0] / goal[2] * first[2] + (i - middle) * _CELL
             first[1] = goal[1] / goal[2] * first[2] + (j - middle) * _CELL
             step, came = _distance(first, cell), _distance(_ENTRY, first)
-            turn = _bend(step + 2.0 * _UNCERTAIN, curvature) + _tilt(2.0 * _UNCERTAIN, step)
-            if _corner(_ENTRY, first, cell) > _reach_bend(came, curvature) + turn:
+            turn = _largest_bend(step, 2.0 * _UNCERTAIN, curvature)
+            if _corner(_ENTRY, first, cell) > _largest_bend(came, _UNCERTAIN, curvature) + turn:
                 continue
             if _corner(first, cell, goal) > turn + ahead:
                 continue
@@ -136,27 +136,10 @@ def _is_entered(
 
 
 @compiled
-def _reach_bend(distance: float, curvature: float) -> float:
-    """Return the largest angle between the direction from the entry and a heading [rad]."""
-    return _bend(distance + _UNCERTAIN, curvature) + _tilt(_UNCERTAIN, distance)
-
-
-@compiled
-def _goal_bend(distance: float, curvature: float, tolerance: float) -> float:
-    """Return the largest angle between a heading and the direction to the target [rad]."""
-    uncertain = tolerance + _UNCERTAIN
-    return _bend(distance + uncertain, curvature) + _tilt(uncertain, distance)
-
-
-@compiled
-def _bend(distance: float, curvature: float) -> float:
-    return math.asin(min(0.5 * curvature * distance, 1.0))
-
-
-@compiled
-def _tilt(uncertain: float, length: float) -> float:
-    """Return the uncertainty of a direction over a length [rad]."""
-    return math.asin(uncertain / length) if length > uncertain else math.pi
+def _largest_bend(distance: float, uncertain: float, curvature: float) -> float:
+    """Return the largest angle between a heading and the direction to an uncertain point [rad]."""
+    bend = math.asin(min(0.5 * curvature * (distance + uncertain), 1.0))
+    return bend + (math.asin(uncertain / distance) if distance > uncertain else math.pi)
 
 
 @compiled

@@ -102,11 +102,8 @@ class Obstacles:
             Position in `rig` [m].
         """
         point = np.asarray(position, dtype=float)
-        nearest = math.inf
-        for row in self.table:
-            distance = segment_distance(point, point, row[:3], row[3:6])
-            nearest = min(nearest, float(distance - row[6]))
-        return nearest
+        distances = (segment_distance(point, point, row, row[3:]) - row[6] for row in self.table)
+        return float(min(distances, default=math.inf))
 
 
 def obstacles_from_markers(message: Markers) -> Obstacles:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.laws.law import SteeringCommand
-from needle_controller.model.arrays import Array
+from needle_controller.laws.point_turns import write_need
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.observers.estimator import Estimate, pose_estimate
 from needle_controller.presets.own_parts import OwnPart, own_part
@@ -49,7 +49,8 @@ class OwnLaw:
         """Return the command for the next step to a point; see `PointLaw`."""
         goal = np.array(target, dtype=float)
         rate = self._part.call("to_point", self._law.to_point, estimate, goal.copy())
-        return self._command("to_point()", rate, estimate, _arc_left(estimate, goal))
+        arc_length = write_need((goal - estimate.position) @ estimate.rotation, np.empty(2))
+        return self._command("to_point()", rate, estimate, arc_length)
 
     def _command(
         self, what: str, rate: Any, estimate: Estimate, left: float | None = None
@@ -76,11 +77,3 @@ def checked_law(name: str) -> OwnPart:
     if callable(getattr(part.cls, "to_point", None)):
         law.to_point(estimate, np.array([0.0, 0.0, 0.1]))
     return part
-
-
-def _arc_left(estimate: Estimate, target: Array) -> float:
-    """Return the length of the arc along the heading to a target, negative behind the tip [m]."""
-    x, y, ahead = (target - estimate.position) @ estimate.rotation
-    aside = np.hypot(x, y)
-    angle = np.arctan2(aside, np.abs(ahead))
-    return float(np.copysign(np.hypot(aside, ahead) / np.sinc(angle / np.pi), ahead))

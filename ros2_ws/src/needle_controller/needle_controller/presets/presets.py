@@ -34,10 +34,11 @@ def make_law(settings: SteeringSettings, gains: Gains) -> LinearizingLaw | OpenL
 
 def filter_settings(settings: SteeringSettings) -> FilterSettings:
     """Return the filter settings of preset `best`."""
+    is_bounded = settings.tip_covariance == "configured" and settings.tip_noise == "bounded"
     return FilterSettings(
         curvature=settings.curvature,
         tip_noise_bound=settings.tip_noise_bound,
-        noise_hypotheses=BOUNDED_NOISE if settings.has_bounded_noise else NORMAL_NOISE,
+        noise_hypotheses=BOUNDED_NOISE if is_bounded else NORMAL_NOISE,
         initial_angle_std=settings.entry_angle_std,
     )
 

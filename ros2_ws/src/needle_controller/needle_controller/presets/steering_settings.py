@@ -283,11 +283,6 @@ class SteeringSettings:
         names = ("step_length", "max_rotation_per_length", "max_winding")
         return {name: getattr(self, name) for name in names}
 
-    @property
-    def has_bounded_noise(self) -> bool:
-        """Whether the tips have bounded noise instead of a covariance."""
-        return self.tip_covariance == "configured" and self.tip_noise == "bounded"
-
     def configured_covariance(self) -> Array | None:
         """Return the configured covariance [m^2], shape (3, 3); None for bounded noise."""
         if self.tip_noise == "bounded":

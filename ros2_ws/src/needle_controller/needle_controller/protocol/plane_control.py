@@ -80,9 +80,7 @@ class PlaneControl:
     Parameters
     ----------
     settings : SteeringSettings
-        Settings of estimator and law.
-    plane : TargetPlane
-        The target plane.
+        Settings of estimator and law, target plane or point, and obstacles.
 
     Attributes
     ----------
@@ -90,14 +88,14 @@ class PlaneControl:
         Obstacles on the path to a point; they may change at any time.
     """
 
-    def __init__(self, settings: SteeringSettings, plane: TargetPlane) -> None:
+    def __init__(self, settings: SteeringSettings) -> None:
         self._settings = settings
-        self._plane = plane
+        self._plane = settings.plane()
         self._points: PointSteering | None = None
         self.target_point = _configured_point(settings)
         self.obstacles = configured_obstacles(settings)
         self._path = PathSteering(settings)
-        self._estimator, self._law = _new_controller(settings, plane)
+        self._estimator, self._law = _new_controller(settings, self._plane)
         self._joints: JointSample | None = None
         self._first_joints: JointSample | None = None
         self._rotation = 0.0

@@ -76,7 +76,7 @@ class Steering:
 
     def __init__(self, settings: SteeringSettings) -> None:
         self.settings = settings
-        self.control = PlaneControl(settings, settings.plane())
+        self.control = PlaneControl(settings)
         self.state = SteeringState.IDLE
         self.awaiting = Awaiting.NOTHING
         self.reason = "not started"

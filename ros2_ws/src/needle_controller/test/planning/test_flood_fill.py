@@ -15,6 +15,8 @@ from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
 
+from .scenes import random_obstacles
+
 CURVATURE = 1.0 / 0.1356
 SETTINGS = PathSettings(math.radians(30.0) / 0.001, curvature_share=1.0, gentle_share=1.0)
 PLANNER = PathPlanner(SETTINGS)
@@ -84,14 +86,7 @@ def test_the_flood_fill_never_excludes_an_existing_path() -> None:
     paths = 0
     for seed in range(16):
         rng = np.random.default_rng([5, seed])
-        rows = rng.uniform([-0.012, -0.012, 0.02], [0.012, 0.012, 0.07], (5, 3))
-        ends = rows + rng.normal(0.0, 0.008, (5, 3))
-        obstacles = Obstacles(
-            [
-                Obstacle(tuple(start), tuple(end), float(rng.uniform(0.003, 0.008)))
-                for start, end in zip(rows.tolist(), ends.tolist(), strict=True)
-            ]
-        )
+        obstacles = random_obstacles(rng, 5, 0.008)
         target = np.array([*rng.uniform(-0.02, 0.02, 2), 0.09])
         if PLANNER.path(ENTRY, target, obstacles) is not None:
             paths += 1

@@ -1,4 +1,4 @@
-"""Legs: advance compared with scipy's exponential, aiming, miss distance, truncation."""
+"""Legs: aiming, miss distance, truncation."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.planning.legs import (
     MOST_POINTS,
-    advance_pose,
     leg_length,
     leg_towards,
     trace_leg,
@@ -27,20 +25,6 @@ def pose_of(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Array:
     pose = np.zeros((3, 4))
     pose[:, :3] = rotation_from_angles([yaw, pitch, roll])
     return pose
-
-
-def test_an_advance_is_the_exponential_of_its_twist() -> None:
-    pose, moved = pose_of(0.7, 0.3, -0.2), np.empty((3, 4))
-    before = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
-    for length, turn in ((0.03, 1.5), (1e-5, 0.0), (0.002, -3.0), (0.0, 1.0)):
-        advance_pose(pose, length, turn, CURVATURE, moved)
-        twist = np.zeros((4, 4))
-        twist[1, 2], twist[2, 1] = -CURVATURE * length, CURVATURE * length
-        twist[0, 1], twist[1, 0], twist[2, 3] = -turn, turn, length
-        np.testing.assert_allclose(moved, (before @ expm(twist))[:3], atol=1e-12)
-    in_place = pose.copy()
-    advance_pose(in_place, 0.0, 1.0, CURVATURE, in_place)
-    np.testing.assert_allclose(in_place, moved)
 
 
 def test_a_leg_leads_to_its_aim() -> None:

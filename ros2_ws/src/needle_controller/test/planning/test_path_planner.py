@@ -20,6 +20,8 @@ from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
 from needle_core.errors import UserError
 
+from .scenes import random_obstacles
+
 CURVATURE = 1.0 / 0.122
 RATE = math.radians(30.0) / 0.001
 TARGET = np.array([0.004, -0.006, 0.1])
@@ -83,14 +85,7 @@ def test_a_simulated_path_is_clear_and_ends_within_the_tolerance() -> None:
         turned = rotation_from_angles(rng.uniform([-0.1, -0.1, -3.0], [0.1, 0.1, 3.0]))
         tip = TipState(rng.uniform(-0.005, 0.005, 3), turned, CURVATURE)
         target = np.array([*rng.uniform(-0.025, 0.025, 2), 0.09])
-        rows = rng.uniform([-0.012, -0.012, 0.02], [0.012, 0.012, 0.07], (4, 3))
-        ends = rows + rng.normal(0.0, 0.008, (4, 3))
-        obstacles = Obstacles(
-            [
-                Obstacle((a[0], a[1], a[2]), (b[0], b[1], b[2]), rng.uniform(0.003, 0.007))
-                for a, b in zip(rows.tolist(), ends.tolist(), strict=True)
-            ]
-        )
+        obstacles = random_obstacles(rng, 4, 0.007)
         path = plans.path(tip, target, obstacles)
         if path is None:
             continue

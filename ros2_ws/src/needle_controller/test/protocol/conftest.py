@@ -11,5 +11,4 @@ from needle_controller.protocol.plane_control import PlaneControl
 @pytest.fixture(scope="session", autouse=True)
 def _loaded() -> None:
     for preset in ("best", "paper"):
-        settings = SteeringSettings(preset=preset)
-        PlaneControl(settings, settings.plane())
+        PlaneControl(SteeringSettings(preset=preset))

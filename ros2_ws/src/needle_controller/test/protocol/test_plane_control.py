@@ -48,7 +48,7 @@ class Needle:
         start = initial_pose(np.deg2rad(2.0), np.deg2rad(starts_deg) + turned)
         self.plant = NeedlePlant(start, curvature=1 / 0.122)
         self.settings = settings
-        self.control = PlaneControl(settings, settings.plane())
+        self.control = PlaneControl(settings)
         self.joints = JointSample(0, 0.0, turned)
         self.rng = np.random.default_rng(5)
         self.turns = 0.0
@@ -218,7 +218,7 @@ def test_steering_ends_at_the_depth_before_the_point() -> None:
 
 
 def test_new_settings_keep_targets_and_obstacles_unless_they_change_them() -> None:
-    control = PlaneControl(PLANE, PLANE.plane())
+    control = PlaneControl(PLANE)
     assert control.target_point is None
     control.plane = offset_plane(0.005)
     control.target_point, control.obstacles = np.array(POINT), WALL
@@ -258,7 +258,7 @@ def test_the_needle_reaches_a_point_past_an_obstacle() -> None:
 
 
 def test_the_reason_without_path_names_an_entry_with_a_path() -> None:
-    control = PlaneControl(TO_PAST, offset_plane(0.0))
+    control = PlaneControl(TO_PAST)
     control.obstacles = Obstacles([Obstacle(PAST, PAST, 0.004)])
     assert "the target point is -0.004 m from an obstacle" in control.path_problem(0.0)
     control.obstacles = Obstacles([Obstacle((0.0, 0.0, 0.003), (0.0, 0.0, 0.003), 0.004)])
