@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -20,14 +19,8 @@ on_typed_numpy = pytest.mark.skipif(
 
 
 def passes(*arguments: str | Path) -> None:
-    paths = [str(ROOT / "scripts/lib"), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-        capture_output=True,
-        text=True,
-        check=False,
+        [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
 

@@ -1,15 +1,18 @@
-"""package.xml lists the packages that its package imports, for rosdep and colcon."""
+"""package.xml and the import contracts name what the packages import."""
 
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
-PACKAGES = sorted(Path(__file__).parents[2].glob("ros2_ws/src/*/package.xml"))
+ROOT = Path(__file__).parents[2]
+PACKAGES = sorted(ROOT.glob("ros2_ws/src/*/package.xml"))
+ROS = re.compile(r"rclpy|rosidl_.*|launch|launch_ros|.*_msgs|.*_interfaces|std_srvs")
 # Names of rosdep keys.
 ROSDEP_KEYS = {
     "can": "python3-can",
@@ -65,3 +68,18 @@ def test_a_manifest_names_what_the_package_imports(manifest: Path) -> None:
     named = {element.text for element in root.iter("exec_depend")}
     assert required - named == set()
     assert not {name for name in named - required if name and name.startswith("python3-")}
+
+
+def test_the_contracts_name_every_package_and_all_imported_packages_of_ros() -> None:
+    text = (ROOT / "pyproject.toml").read_text("utf-8")
+    protected = text.partition("\nprotected_modules = [")[2].partition("]")[0]
+    imported = {
+        name
+        for manifest in PACKAGES
+        for name in imports_of(manifest.parent / manifest.parent.name)
+        if ROS.fullmatch(name)
+    }
+    assert set(re.findall(r'"(.+?)"', protected)) == {"*.ros", *imported}
+    for manifest in PACKAGES:
+        # root_packages, and at least one contract on its layers and one on its neighbours
+        assert text.count(f'"{manifest.parent.name}"') >= 3

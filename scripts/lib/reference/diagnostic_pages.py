@@ -94,17 +94,9 @@ def diagnostics_page(nodes: Sequence[RigNode]) -> str:
         for node in nodes
         for part, keys in node.parts.items()
     ]
-    worded = {
-        (each.package, each.module, each.level, each.text): each for each in diagnostic_texts()
-    }
     rows = [
-        (
-            code(each.package),
-            code(each.module.removesuffix(".py")),
-            each.level,
-            code(each.text),
-        )
-        for each in worded.values()
+        (code(each.package), code(each.module.removesuffix(".py")), each.level, code(each.text))
+        for each in dict.fromkeys(diagnostic_texts())
     ]
     every = [(code(part), text) for part, text in IN_EVERY_NODE.items()]
     return (

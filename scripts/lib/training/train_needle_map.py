@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 from needle_bringup.training.traced_scenes import trace_scene
 from needle_core.commands.cli import run_command
+from needle_core.commands.options import CommandParser
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.path_traced.tracer import load_mitsuba
 from needle_sim.sequences.boxes import draw_box
@@ -126,12 +127,7 @@ def wait_for_samples(folder: Path, drawn: int, process: BaseProcess) -> None:
 
 def read_arguments() -> argparse.Namespace:
     """Return the arguments of the command line."""
-    parser = argparse.ArgumentParser(
-        prog="scripts/train_needle_map",
-        description=__doc__,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = CommandParser("scripts/train_needle_map", __doc__ or "", _EXAMPLES)
     parser.add_argument("--steps", type=int, default=24000, metavar="N", help="default: 24000")
     parser.add_argument(
         "--minutes",

@@ -16,7 +16,7 @@ from typing import IO, Any
 
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.recording import FreeSpace, Received, Recording
-from needle_bags.recording.worker import Job, RunJob, no_op
+from needle_bags.recording.worker import Job, RunJob
 from needle_core.component import Actions, Component, Input, Moment, Output, Timer
 from needle_core.files.bag_topic import BagTopic
 from scenario.faults import Fault, Kind
@@ -115,7 +115,6 @@ class _Jobs:
     def __init__(self, do: RunJob, end: Job) -> None:
         self._do, self._end = do, end
         self._jobs: deque[Job] = deque()
-        self._due = 0.0
 
     @property
     def waiting(self) -> int:
@@ -124,13 +123,13 @@ class _Jobs:
     def put(self, job: Job) -> None:
         self._jobs.append(job)
 
-    def work(self, now: float, seconds: float, cost: Callable[[], float]) -> None:
-        """Run as many jobs as `seconds` allow."""
-        if not self._jobs and now >= self._due:
-            self._due = self._do(no_op)
+    def work(self, seconds: float, cost: Callable[[], float]) -> None:
+        """Run as many jobs as `seconds` allow, and flush if there are none."""
+        if not self._jobs:
+            self._do(lambda: None)
         while self._jobs and seconds > 0.0:
             seconds -= cost()
-            self._due = self._do(self._jobs.popleft())
+            self._do(self._jobs.popleft())
 
     def finish(self) -> None:
         while self._jobs:
@@ -222,7 +221,7 @@ class RecorderStandIn(Component):
         self._now = at.steady
         if not self._disk.is_frozen:
             draw, slowness = self._chance.uniform, self._disk.slowness
-            self._jobs.work(at.steady, _WORK, lambda: draw(*_JOB) + slowness)
+            self._jobs.work(_WORK, lambda: draw(*_JOB) + slowness)
             self._note_refusal()
         return ()
 

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
-from made_up_run import copy_messages, make_run, serialized, write_run
+from made_up_run import STORE, copy_messages, make_run, serialized, write_run
 from needle_bags.format.bag_writer import BagCopy
 from needle_bags.reading.bag_messages import SentMessage, read_contents
 from needle_bags.reading.bag_reader import Run, read_run
@@ -22,7 +21,6 @@ __all__ = ["make_run"]
 
 BAG = Path(__file__).resolve().parents[4] / "bags" / "regression"
 COMMAND = "scripts/simulate --level=tip --params='a <file>.yaml'"
-STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 @pytest.fixture(autouse=True)

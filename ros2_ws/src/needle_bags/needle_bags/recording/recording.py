@@ -6,7 +6,7 @@ import contextlib
 import ctypes
 import dataclasses
 import json
-import os
+import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -91,13 +91,12 @@ class FreeSpace:
 
     def __init__(self, directory: Path, reserve: int) -> None:
         self._directory = directory
-        status = os.statvfs(directory)
-        self.reserve = min(reserve, int(LARGEST_RESERVE_SHARE * status.f_blocks * status.f_frsize))
+        largest = LARGEST_RESERVE_SHARE * shutil.disk_usage(directory).total
+        self.reserve = min(reserve, int(largest))
 
     def usable(self) -> int:
         """Return the number of bytes that may still be written; negative below the reserve."""
-        status = os.statvfs(self._directory)
-        return int(status.f_bavail * status.f_frsize) - self.reserve
+        return shutil.disk_usage(self._directory).free - self.reserve
 
 
 class Recording:
@@ -191,6 +190,11 @@ class Recording:
         """Queue a text for metadata.yaml's `custom_data`."""
         self._worker.put(lambda: self._bag.set_custom_data(key, value))
 
+    def flush_idle(self) -> None:
+        """Flush if it is due and nothing is queued; call this every `FLUSH_PERIOD`."""
+        if not self.messages_waiting:
+            self._worker.put(lambda: None)
+
     def close(self, lost_before: Mapping[str, int] | None = None) -> None:
         """Write all queued messages, the index and the metadata; see `error` and `is_whole`.
 
@@ -233,11 +237,11 @@ class Recording:
     def _drop(self, topic: str) -> None:
         self.dropped[topic] = self.dropped.get(topic, 0) + 1
 
-    def _run_job(self, job: Job) -> float:
-        """Run a job, then flush and check the disk; return the time of the next flush."""
+    def _run_job(self, job: Job) -> None:
+        """Run a job, then flush and check the disk if this is due."""
         if self.error is not None:
             job()
-            return self._clock() + FLUSH_PERIOD
+            return
         try:
             job()
             self._check_disk()
@@ -246,7 +250,6 @@ class Recording:
         # An exception must not end the worker, or all later messages would stay queued.
         except Exception as error:  # noqa: BLE001
             self._end_early(f"{type(error).__name__}: {error}")
-        return self._next_flush
 
     def _check_disk(self) -> None:
         """Flush if it is due; end the recording if the disk has no usable space."""

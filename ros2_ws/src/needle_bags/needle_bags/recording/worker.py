@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Callable
 from typing import Protocol
 
 Job = Callable[[], None]
-RunJob = Callable[[Job], float]
-"""Runs a job; returns the monotonic time at which the next call is due [s]."""
-
-
-def no_op() -> None:
-    """No-op job, used for periodic wake-ups."""
+RunJob = Callable[[Job], None]
 
 
 class Worker(Protocol):
@@ -42,7 +36,7 @@ class WorkerThread:
         Called once, after the last job.
     """
 
-    def __init__(self, run_job: RunJob, end: Callable[[], None]) -> None:
+    def __init__(self, run_job: RunJob, end: Job) -> None:
         self._run_job = run_job
         self._end = end
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
@@ -64,13 +58,6 @@ class WorkerThread:
         self._thread.join()
 
     def _run(self) -> None:
-        due = self._run_job(no_op)
-        while True:
-            try:
-                job = self._jobs.get(timeout=max(0.0, due - time.monotonic()))
-            except queue.Empty:
-                job = no_op
-            if job is None:
-                self._end()
-                return
-            due = self._run_job(job)
+        while (job := self._jobs.get()) is not None:
+            self._run_job(job)
+        self._end()

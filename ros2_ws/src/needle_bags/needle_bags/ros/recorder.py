@@ -215,6 +215,7 @@ class Recorder(WholeNode):
         else:
             self._topics.poll()
             self._snapshots.poll()
+            self.recording.flush_idle()
 
     def _add_topic(self, topic: BagTopic) -> None:
         self.recording.add_topic(topic)

@@ -15,6 +15,7 @@ from rosbags.interfaces import QosDurability, QosReliability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from made_up_run import STORE
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter, standard_topic, string_message
 from needle_bags.format.message_definitions import full_definition
@@ -26,7 +27,6 @@ from needle_bags.recording.worker import Job, RunJob
 from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 TIME = 1_700_000_000_000_000_000
 RIG_TYPES = (
     *(f"sensor_msgs/msg/{name}" for name in ("Image", "CameraInfo", "JointState", "Joy")),

@@ -20,13 +20,14 @@ from std_msgs.msg import Bool, Int32, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
+from made_up_run import STORE
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
 from needle_bags.ros import player as node
 from needle_core.files.bag_topic import BagTopic
 
-from .played_graph import STORE, PlayedGraph, type_name
+from .played_graph import PlayedGraph, type_name
 
 START = 1_700_000_000_000_000_000
 KEPT = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)

@@ -106,6 +106,7 @@ def test_the_bag_has_all_messages_and_what_a_rerun_needs(
     scene.offer("/numbered", Int32)
     scene.offer("/tracker/annotated_image", Int32)
     scene.offer(EVENTS, ParameterEvent)
+    file = scene.bag / "bag_0.mcap"
 
     def act() -> None:
         scene.answer_all()
@@ -116,7 +117,10 @@ def test_the_bag_has_all_messages_and_what_a_rerun_needs(
         event.changed_parameters = [Parameter("gain", value=2.5).to_parameter_msg()]
         scene.send(EVENTS, event)
         scene.offer("/rig/late", Int32, BEST_EFFORT)
+        before = file.stat().st_size
         scene.run(0.1)
+        # A kill now would lose nothing, although no message has followed.
+        assert file.stat().st_size > before
         # Messages that arrive shortly after the signal are recorded, too.
         scene.at(0.1, lambda: scene.send("/rig/late", Int32(data=1)))
         scene.at(0.35, lambda: scene.send("/rig/late", Int32(data=2)))
@@ -134,7 +138,7 @@ def test_the_bag_has_all_messages_and_what_a_rerun_needs(
     assert yaml.safe_load(custom["parameters"])["/source"] == {"ros__parameters": {"gain": 1.5}}
     (change,) = yaml.safe_load(custom["parameter_changes"])
     assert (change["node"], change["name"], change["value"]) == ("/source", "gain", 2.5)
-    data = (scene.bag / "bag_0.mcap").read_bytes()
+    data = file.read_bytes()
     assert all(text in data for text in (b"gain: 1.5", b"parameter_change", b"0123abc"))
     assert scene.health("parameters_of").message == "/recorder, /source"
 
@@ -154,7 +158,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_node(
 
     def act() -> None:
         scene.send("/numbered", *(Int32(data=number) for number in range(5)))
-        scene.run(0.2)
+        scene.now += 0.2
         # The first of these flushes all earlier ones; the second meets the full disk.
         scene.send("/numbered", *(Int32(data=number) for number in range(5, 9)))
         scene.run(0.5)

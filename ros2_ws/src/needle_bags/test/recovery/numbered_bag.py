@@ -12,15 +12,12 @@ from mcap.records import ChunkIndex, Message
 from mcap.stream_reader import StreamReader
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_metadata import (
-    USUAL_QOS,
-)
+from made_up_run import STORE, message, serialized
+from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter, standard_topic
 from needle_core.files.bag_topic import BagTopic
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPE = "std_msgs/msg/UInt8MultiArray"
 LATCHED = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
 TOPICS = [
@@ -36,8 +33,8 @@ RUN = {"commit": "0123abc", "run_info": "seed: 3"}
 def payload(number: int) -> bytes:
     """Return a message with its number that does not end in 0, unlike zeros after a power cut."""
     content = np.frombuffer(np.random.default_rng(number).bytes(100) + b"\x01", np.uint8)
-    layout = STORE.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=number)
-    return bytes(STORE.serialize_cdr(STORE.types[TYPE](layout=layout, data=content), TYPE))
+    layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=number)
+    return serialized(message(TYPE, layout=layout, data=content))
 
 
 def number_of(data: bytes) -> int:

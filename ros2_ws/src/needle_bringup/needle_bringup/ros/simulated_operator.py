@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable
-from typing import Any, TextIO
+from typing import TextIO
 
 from needle_bringup.simulated_operator.component import (
     PROGRESS,
@@ -16,7 +15,6 @@ from needle_bringup.simulated_operator.component import (
 from needle_bringup.simulated_operator.progress import PROGRESS_FD, Progress
 from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_core.ros.main import run_component
-from needle_core.status_messages import ControllerStatus
 
 HELP = """\
 simulated_operator: operates the hold-to-run switch of a simulated rig.
@@ -36,23 +34,6 @@ invalid; 130 interrupted
 """
 
 
-class _ProgressPort:
-    """Port that shows the progress in the terminal."""
-
-    def __init__(self) -> None:
-        self._progress = Progress(_progress_stream())
-
-    def open(self, arrive: Callable[[Any], None]) -> None:
-        """Do nothing: this port has no events."""
-
-    def send(self, batch: tuple[ControllerStatus, ...]) -> None:
-        for status in batch:
-            self._progress.show(status)
-
-    def close(self) -> None:
-        self._progress.close("")
-
-
 def _progress_stream() -> TextIO:
     """Return stderr, or the stream that the parent process keeps open."""
     descriptor = os.environ.get(PROGRESS_FD)
@@ -68,7 +49,7 @@ def main() -> int:
         SimulatedOperatorParameters,
         lambda settings, name: SimulatedOperator(settings, name, time.monotonic()),
         help_text=HELP,
-        ports=lambda _: {PROGRESS: _ProgressPort()},
+        ports=lambda _: {PROGRESS: Progress(_progress_stream())},
         interrupted=EXIT_INTERRUPTED,
         shared_memory=False,
     )

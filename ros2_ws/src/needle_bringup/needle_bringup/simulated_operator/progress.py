@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TextIO
+from collections.abc import Callable
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
@@ -14,6 +15,8 @@ PROGRESS_FD = "NEEDLE_PROGRESS_FD"
 
 class Progress:
     """Progress bar on a terminal, otherwise a line for every quarter of the insertion.
+
+    It is also the port of `SimulatedOperator` for its progress.
 
     Parameters
     ----------
@@ -27,6 +30,14 @@ class Progress:
         self._bar: tqdm[None] | None = None
         self._shown_quarter = 0
         self._last_reason = ""
+
+    def open(self, arrive: Callable[[Any], None]) -> None:
+        """Do nothing: this port has no events."""
+
+    def send(self, batch: tuple[ControllerStatus, ...]) -> None:
+        """Show the statuses of a batch."""
+        for status in batch:
+            self.show(status)
 
     def show(self, status: ControllerStatus) -> None:
         """Show the insertion, and print each new reason for waiting once."""
@@ -48,7 +59,7 @@ class Progress:
             self._shown_quarter = quarter
             print(f"{insertion * 1e3:5.1f} of {depth * 1e3:.1f} mm", file=self.stream, flush=True)
 
-    def close(self, line: str) -> None:
+    def close(self, line: str = "") -> None:
         """Remove the bar and print a line, unless it is empty."""
         self._remove_bar()
         if line:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -63,7 +64,39 @@ class StudyPart:
 
     def run(self, on_progress: Callable[[int], None] = lambda _: None) -> Outcomes | PointOutcomes:
         """Steer the needles; `on_progress` is called after each step with their number."""
-        return (_to_points if self.options.targets else _to_plane)(self, on_progress)
+        options = self.options
+        controller: dict[str, Any] = {
+            "sigma_scale": options.sigma_scale,
+            "own": {name: getattr(options, name) for name in _OWN},
+            "first": self.first,
+        }
+        study: dict[str, Any] = {
+            "on_progress": on_progress,
+            "chunk": len(self.starts),
+            "first": self.first,
+        }
+        if options.targets:
+            targets = MovingTargets(
+                self.points, options.target_drift, options.target_breath, options.seed, self.first
+            )
+            new_point_controller = point_controller_factory(
+                options.controller,
+                options.claimed_bound,
+                rotation_budget=options.rotation_budget,
+                **controller,
+            )
+            return run_point_study(
+                self.starts, targets, new_point_controller, settings_of(options), **study
+            )
+        flips = np.linspace(0.0, options.depth, options.flips + 2)[1:-1].tolist()
+        new_controller = controller_factory(
+            options.controller,
+            options.claimed_bound,
+            flips,
+            turn_delay=options.turn_delay,
+            **controller,
+        )
+        return run_study(self.starts, new_controller, settings_of(options), **study)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,53 +161,6 @@ def _starts(options: MonteCarloOptions) -> FloatArray:
     grid = "random" if options.targets else options.grid
     draws = -(-count // POINTS**3)
     return GRIDS[grid](options.bounds, draws, options.seed)[:count]
-
-
-def _own(options: MonteCarloOptions) -> dict[str, str | float]:
-    return {name: getattr(options, name) for name in _OWN}
-
-
-def _to_plane(part: StudyPart, on_progress: Callable[[int], None]) -> Outcomes:
-    options = part.options
-    flips = np.linspace(0.0, options.depth, options.flips + 2)[1:-1].tolist()
-    return run_study(
-        part.starts,
-        controller_factory(
-            options.controller,
-            options.claimed_bound,
-            flips,
-            sigma_scale=options.sigma_scale,
-            turn_delay=options.turn_delay,
-            own=_own(options),
-            first=part.first,
-        ),
-        settings_of(options),
-        on_progress=on_progress,
-        chunk=len(part.starts),
-        first=part.first,
-    )
-
-
-def _to_points(part: StudyPart, on_progress: Callable[[int], None]) -> PointOutcomes:
-    options = part.options
-    return run_point_study(
-        part.starts,
-        MovingTargets(
-            part.points, options.target_drift, options.target_breath, options.seed, part.first
-        ),
-        point_controller_factory(
-            options.controller,
-            options.claimed_bound,
-            sigma_scale=options.sigma_scale,
-            rotation_budget=options.rotation_budget,
-            own=_own(options),
-            first=part.first,
-        ),
-        settings_of(options),
-        on_progress=on_progress,
-        chunk=len(part.starts),
-        first=part.first,
-    )
 
 
 def _of_plane(outcomes: Outcomes) -> Results:

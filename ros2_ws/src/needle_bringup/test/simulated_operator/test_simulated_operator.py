@@ -1,12 +1,19 @@
-"""The simulated operator as a component: rig messages become the hold, calls, and an end."""
+"""simulated_operator: calls, holds, failures, and when it must not act."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable
 from typing import Any
 
 from needle_bringup.simulated_operator.component import (
+    CALL_TIMEOUT,
+    DISABLE,
+    ENABLE,
+    HOME,
+    PREPARATION,
+    START,
     SimulatedOperator,
     SimulatedOperatorParameters,
 )
@@ -15,36 +22,38 @@ from needle_core.component import Action, Answer, Call, Exit, Moment, Peers, Pub
 from needle_core.diagnostics import Level
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-CONFIRM, HOME, START = "device/confirm_needle_out", "device/home", "plane_controller/start"
-STARTED = [(CONFIRM, True), (HOME, None), ("device/enable", True), (START, None)]
-DISABLE = ("device/enable", False)
-RIG = "sim_rig"
+CONFIRM = PREPARATION[0]
+RIG, DRIVER, NAME = "/sim_rig", "/device_driver", "stand_in"
+FRESH = DeviceStatus(source=RIG, simulated=True)
+DISABLED = dataclasses.replace(FRESH, homed=True, state="DISABLED")
+HOLDING = dataclasses.replace(DISABLED, state="HOLDING")
+MOVING = dataclasses.replace(DISABLED, state="MOVING")
+STEERING = ControllerStatus(
+    state="STEERING", step=3, insertion_m=0.003, depth_m=0.12, starts=1, reason=""
+)
+
+
+def moment(now: float) -> Moment:
+    return Moment(now, round(now * 1e9))
 
 
 class Scene:
-    """Simulated operator in a rig that accepts all calls, or answers none."""
+    """Simulated operator in a rig that the test plays."""
 
-    def __init__(self, *, refusal: str = "", mute: bool = False, **settings: Any) -> None:
-        self.operator = SimulatedOperator(SimulatedOperatorParameters(**settings), "stand_in")
-        self.refusal, self.mute = refusal, mute
-        self.now = 0.0
-        self.device = DeviceStatus(source=RIG, homed=True, state="DISABLED", simulated=True)
-        self.controller = ControllerStatus(state="IDLE", starts=0, depth_m=0.12)
-        self.asked: list[tuple[str, bool | None]] = []
+    def __init__(self, devices: tuple[str, ...] = (RIG,), **settings: Any) -> None:
+        self.operator = SimulatedOperator(SimulatedOperatorParameters(**settings), NAME)
+        self.rows = {row.topic: row.handler for row in self.operator.inputs}
+        self.calls: list[Call] = []
         self.holds: list[m.HoldState] = []
         self.shown: list[ControllerStatus] = []
-        self.end: Exit | None = None
-        self.discover((RIG,))
+        self.ends: list[Exit] = []
+        self.discover(devices)
 
-    @property
-    def at(self) -> Moment:
-        return Moment(self.now, round(self.now * 1e9))
-
-    def discover(self, devices: tuple[str, ...]) -> None:
+    def discover(self, devices: tuple[str, ...], missing: str = "") -> None:
         topics = {"device/status": devices, "needle/controller_status": (RIG,)}
-        services = frozenset(service for service, _ in STARTED)
-        peers = Peers(topics, {"device/hold": devices}, services, frozenset({RIG, "stand_in"}))
-        self.take(self.operator.on_peers(peers, self.at))
+        services = frozenset(call.service for call in PREPARATION) - {missing}
+        peers = Peers(topics, {"device/hold": devices}, services, frozenset({"sim_rig", NAME}))
+        self.take(self.operator.on_peers(peers, moment(0.0)))
 
     def take(self, actions: Iterable[Action]) -> None:
         for action in actions:
@@ -53,84 +62,294 @@ class Scene:
                     self.holds.append(action.message)
                 case Send():
                     self.shown += action.batch
+                case Call():
+                    self.calls.append(action)
                 case Exit():
-                    self.end = action
-                case Call(service, data):
-                    self.asked.append((service, data))
-                    if not self.mute:
-                        answer = Answer(service, not self.refusal, self.refusal)
-                        self.take(self.operator.on_answer(answer, self.at))
+                    self.ends.append(action)
 
-    def run(self, seconds: float = 1.0, **changes: Any) -> None:
-        """Publish a controller status, and advance time."""
-        self.controller = dataclasses.replace(self.controller, **changes)
-        rows = {row.topic: row.handler for row in self.operator.inputs}
-        for _ in range(round(seconds / 0.05)):
-            self.now += 0.05
-            self.take(rows["device/status"](self.device, self.at))
-            self.take(rows["needle/controller_status"](self.controller, self.at))
-            self.take(self.operator.timers[0].handler(self.at))
+    def device(self, status: DeviceStatus, now: float = 1.0, **changes: Any) -> None:
+        message = dataclasses.replace(status, **changes)
+        self.take(self.rows["device/status"](message, moment(now)))
+
+    def controller(self, now: float = 2.0, **changes: Any) -> None:
+        message = dataclasses.replace(STEERING, **changes)
+        self.take(self.rows["needle/controller_status"](message, moment(now)))
+
+    def answer(self, call: Call, now: float = 1.0, text: str = "", *, success: bool = True) -> None:
+        self.take(self.operator.on_answer(Answer(call.service, success, text), moment(now)))
+
+    def look(self, now: float = 1.0) -> list[Call]:
+        """Run the timer; return the calls since the last look."""
+        self.take(self.operator.timers[0].handler(moment(now)))
+        calls, self.calls = self.calls, []
+        return calls
+
+    @property
+    def is_held(self) -> bool:
+        return bool(self.holds) and self.holds[-1].pressed
+
+    def failure(self, now: float = 50.0) -> str:
+        """Return why the run failed; the hold is released, and an enabled device disabled."""
+        if self.look(now):
+            assert [hold.pressed for hold in self.holds[-3:]] == [False] * 3
+            assert self.ends == []
+            self.answer(DISABLE, now)
+        (end,) = self.ends
+        assert end.code in (1, 2)
+        assert not self.is_held
+        assert self.look(now + 50.0) == []
+        return end.text
 
 
-def steered() -> Scene:
+def known() -> Scene:
+    """Return a scene with a status of the controller, and without one of the device."""
     scene = Scene()
-    scene.run()
-    scene.run(state="STEERING", starts=1, step=1, insertion_m=0.001)
-    assert scene.asked == STARTED
-    assert scene.holds[-1].pressed
+    scene.controller(0.0, state="IDLE", starts=0)
     return scene
 
 
-def test_the_component_prepares_holds_releases_and_disables() -> None:
-    scene = Scene(mute=True)
-    scene.run(0.2)
-    # A press before the device is ready would not count.
-    assert scene.holds
-    assert not any(hold.pressed for hold in scene.holds)
-    scene.mute = False
-    scene.run(1.5)
-    scene.run(state="STEERING", starts=1, step=1, insertion_m=0.001)
-    assert scene.asked == [STARTED[0], *STARTED]
+def reach(wanted: Call | None = None, scene: Scene | None = None) -> Scene:
+    """Return a scene just after its first attempt of a call, at 1.0 s; None: after all calls."""
+    scene = scene or known()
+    scene.device(DISABLED)
+    for call in PREPARATION:
+        assert scene.look() == [call]
+        assert scene.look() == [], "one call at a time"
+        # The device accepts a press only after a release.
+        assert scene.holds
+        assert not scene.is_held
+        if call == wanted:
+            return scene
+        scene.answer(call)
+    assert scene.look() == []
+    assert scene.is_held
+    return scene
+
+
+def test_a_whole_run_is_held_shown_released_and_disabled() -> None:
+    scene = reach()
+    scene.controller()
     held = scene.holds[-1]
-    assert (held.pressed, held.source, held.speed_scale) == (True, "stand_in", 1.0)
-    assert (scene.shown[-1].insertion_m, scene.shown[-1].depth_m) == (0.001, 0.12)
-    scene.run(state="DONE", step=120, insertion_m=0.12)
-    assert scene.end == Exit(0, "inserted 120.0 mm in 120 steps")
-    assert scene.asked[-2:] == [STARTED[-1], DISABLE]
+    assert (held.pressed, held.source, held.speed_scale) == (True, NAME, 1.0)
+    assert scene.shown == [STEERING]
+    scene.controller(3.0, state="DONE", step=120, insertion_m=0.12)
     assert [hold.pressed for hold in scene.holds[-3:]] == [False] * 3
+    assert (scene.calls, scene.ends) == ([DISABLE], [])
+    scene.answer(DISABLE, 3.1)
+    assert scene.ends == [Exit(0, "inserted 120.0 mm in 120 steps")]
 
 
 def test_a_signal_releases_and_disables_before_the_end_and_a_second_one_ends_at_once() -> None:
-    for mute in (False, True):
-        scene = steered()
-        scene.mute = mute
-        scene.take(scene.operator.on_stop(scene.at))
-        assert not scene.holds[-1].pressed
-        assert scene.asked[-1] == DISABLE
-        if mute:
-            assert scene.end is None
-            scene.take(scene.operator.on_stop(scene.at))
-        assert scene.end == Exit(130, "interrupted")
-
-
-def test_a_refusal_and_a_real_device_are_bad_input() -> None:
-    refused = Scene(refusal="the door is open")
-    refused.run(5.0)
-    assert refused.end == Exit(2, "device/confirm_needle_out was refused: the door is open")
-    assert not any(hold.pressed for hold in refused.holds)
-    real = Scene()
-    real.device = dataclasses.replace(real.device, simulated=False)
-    real.run()
-    assert real.end is not None
-    assert (real.end.code, "sim_rig is a real device" in real.end.text) == (2, True)
-    assert (real.asked, real.holds) == ([], [])
+    for is_mute in (False, True):
+        scene = reach()
+        scene.take(scene.operator.on_stop(moment(2.0)))
+        assert not scene.is_held
+        assert (scene.calls, scene.ends) == ([DISABLE], [])
+        if is_mute:
+            scene.take(scene.operator.on_stop(moment(2.1)))
+        else:
+            scene.answer(DISABLE, 2.1)
+        assert scene.ends == [Exit(130, "interrupted")]
 
 
 def test_it_waits_until_the_recorder_has_all_parameters() -> None:
     scene = Scene(wait_for_recorder=True)
-    (row,) = (row for row in scene.operator.inputs if row.topic == "/diagnostics")
-    for recorded, asked in (("/stand_in", []), (f"/stand_in, /{RIG}", STARTED)):
+    scene.device(DISABLED)
+    for recorded, calls in ((f"/{NAME}", []), (f"/{NAME}, {RIG}", [CONFIRM])):
         status = m.Status("/recorder", "parameters_of", Level.OK, recorded)
-        scene.take(row.handler(m.Diagnostics(scene.at.stamp_ns, (status,)), scene.at))
-        scene.run()
-        assert scene.asked == asked
+        scene.take(scene.rows["/diagnostics"](m.Diagnostics(1, (status,)), moment(1.0)))
+        assert scene.look() == calls
+
+
+def test_it_calls_nothing_while_a_partner_is_missing() -> None:
+    scene = known()
+    scene.discover((RIG,), missing="device/home")
+    scene.device(FRESH)
+    assert scene.look(89.9) == []
+    assert scene.ends == []
+    assert scene.look(90.0) == []
+    assert scene.ends == [
+        Exit(2, "the rig is not ready after 90 s: missing service device/home"),
+    ]
+
+
+def test_it_repeats_calls_until_the_rig_is_ready_or_refuses() -> None:
+    scene = reach(CONFIRM)
+    not_yet = "waiting for a subscriber of joint_states"
+    scene.answer(CONFIRM, 1.0, not_yet, success=False)
+    assert scene.look(1.05) == []
+    for now, refusal in ((20.0, not_yet), (20.2, "the needle is in"), (22.2, "the needle is in")):
+        # The cause of a refusal may have changed meanwhile.
+        assert scene.ends == []
+        assert scene.look(now) == [CONFIRM]
+        scene.answer(CONFIRM, now, refusal, success=False)
+    assert scene.ends == [Exit(2, "device/confirm_needle_out was refused: the needle is in")]
+
+
+def test_a_service_that_never_answers_is_named() -> None:
+    assert "no answer from device/confirm_needle_out" in reach(CONFIRM).failure(91.0)
+
+
+def test_a_call_is_repeated_if_its_answer_is_lost() -> None:
+    for call, following in itertools.zip_longest(PREPARATION, PREPARATION[1:]):
+        scene = reach(call)
+        assert scene.look(0.9 + CALL_TIMEOUT) == []
+        assert scene.look(1.0 + CALL_TIMEOUT) == [call]
+        scene.answer(call, 2.1)
+        assert scene.look(2.1) == ([] if following is None else [following])
+        assert scene.is_held is (following is None)
+        # Answers to the earlier attempt change nothing.
+        for success in (True, False):
+            scene.answer(call, 2.2, "the device is MOVING", success=success)
+            assert scene.look(2.5) == []
+            assert scene.is_held is (following is None)
+
+
+def test_an_earlier_status_does_not_end_the_homing() -> None:
+    scene = reach(HOME)
+    scene.answer(HOME, 1.0, "homing")
+    assert scene.look() == []
+    # A device may still report homed from last time while it searches for its switches.
+    for homed in (False, True):
+        scene.device(MOVING, 2.0, homed=homed)
+        assert scene.look(2.0) == []
+    scene.device(DISABLED, 3.0)
+    assert scene.look(3.0) == [ENABLE]
+
+
+def test_a_status_may_replace_the_answer_of_homing() -> None:
+    overtaken, lost, stale = reach(HOME), reach(HOME), reach(HOME)
+    overtaken.device(DISABLED)
+    overtaken.answer(HOME, 1.0, "homing")
+    assert overtaken.look() == [ENABLE]
+    lost.device(MOVING, 1.2)
+    assert lost.look(5.0) == [], "it moves: not asked again"
+    lost.device(DISABLED, 9.0)
+    assert lost.look(9.0) == [ENABLE]
+    # A homed status from before the call does not replace the answer.
+    stale.device(DISABLED, 1.1, needle_out_confirmed=True)
+    assert stale.look(1.2) == []
+    assert stale.look(1.0 + CALL_TIMEOUT) == [HOME]
+
+
+def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
+    scene = reach(START)
+    for now, changes in ((1.1, {"starts": 0, "state": "IDLE"}), (1.2, {})):
+        scene.controller(now, **changes)
+        assert scene.look(now) == []
+        assert scene.is_held == (not changes)
+    scene.answer(START, 1.3, "already steering", success=False)
+    assert scene.look(9.0) == []
+    assert scene.is_held
+
+
+def test_start_requires_a_controller_status() -> None:
+    for is_known in (True, False):
+        scene = Scene()
+        scene.device(DISABLED)
+        for call in PREPARATION[:-1]:
+            assert scene.look() == [call]
+            scene.answer(call)
+        assert scene.look() == []
+        if is_known:
+            scene.controller(1.1, state="DONE", starts=4)
+            assert scene.look(1.1) == [START]
+            scene.answer(START, 1.1)
+            assert scene.ends == []
+        else:
+            assert "no needle/controller_status received" in scene.failure(91.0)
+
+
+def test_the_outcome_names_the_reason() -> None:
+    for state, reason in (("FAULT", "curvature lost"), ("IDLE", "stopped by hand")):
+        scene = reach()
+        scene.controller()
+        scene.controller(3.0, state=state, reason=reason)
+        assert reason in scene.failure()
+    for state in ("FAULT", "ESTOPPED"):
+        scene = reach()
+        scene.device(DISABLED, state=state, reason="button")
+        assert "button" in scene.failure()
+
+
+def test_statuses_before_the_start_are_ignored() -> None:
+    for state in ("DONE", "FAULT", "IDLE"):
+        scene = known()
+        scene.controller(0.5, state=state)
+        reach(None, scene)
+        scene.controller(2.0, state=state)
+        scene.controller(2.0, starts=2)
+        assert scene.look(2.0) == []
+        assert scene.is_held
+        scene.controller(3.0, state="DONE", starts=2)
+        scene.answer(DISABLE, 3.0)
+        assert [end.code for end in scene.ends] == [0]
+
+
+def test_a_start_that_ends_immediately_fails_the_run() -> None:
+    """STEERING, then IDLE: a latched status of depth 1 may show only the second."""
+    for state, overtakes in itertools.product(("FAULT", "IDLE"), (False, True)):
+        scene = known()
+        scene.controller(0.5, state="IDLE")
+        reach(START, scene)
+        if not overtakes:
+            scene.answer(START)
+        scene.controller(1.0, state=state, starts=2, reason="the needle was drawn back")
+        scene.answer(START)
+        assert "the needle was drawn back" in scene.failure()
+        assert scene.ends[0].code == 1
+
+
+def test_no_progress_releases_the_hold() -> None:
+    scene = reach()
+    scene.controller(10.0)
+    scene.controller(30.0)
+    assert scene.look(39.9) == []
+    assert scene.is_held
+    assert "no progress for 30 s at 3.0 mm" in scene.failure(40.0)
+
+
+def test_an_ignored_press_is_released_and_repeated() -> None:
+    for counted_before in (False, True):
+        scene = reach()
+        if counted_before:
+            scene.device(HOLDING, 1.1, hold_owner=NAME)
+        # The device has heard the release in between. On a busy machine statuses arrive late: a
+        # step may be under way without one.
+        for now, again in ((9.0, NAME), (9.1, ""), (9.2, "somebody"), (30.0, "")):
+            scene.device(HOLDING, now, press_again=again)
+            assert scene.look(now) == []
+            assert scene.is_held is (again != NAME)
+
+
+def test_a_real_device_ends_the_run() -> None:
+    for wanted in (*PREPARATION, None):
+        scene = reach(wanted)
+        scene.device(DISABLED, source=DRIVER, simulated=False)
+        assert f"{DRIVER} is a real device" in scene.failure()
+    scene = known()
+    scene.device(DISABLED, simulated=False)
+    assert [end.code for end in scene.ends] == [2]
+    assert (scene.look(), scene.holds) == ([], [])
+
+
+def test_it_acts_only_on_a_single_simulated_device() -> None:
+    scene = Scene((DRIVER,))
+    assert scene.look() == [], "nothing is known of it yet"
+    scene.device(FRESH)
+    assert scene.look() == [], "another said that"
+    scene.discover((RIG, DRIVER))
+    assert scene.look() == []
+    assert scene.ends == [], "one that was killed counts for a while"
+    assert f"received it from {RIG}, {DRIVER}" in scene.failure(90.0)
+    assert scene.holds == []
+
+
+def test_a_second_device_ends_the_run() -> None:
+    scene = reach()
+    before = len(scene.holds)
+    scene.discover((DRIVER,))
+    assert scene.look(1.1) == []
+    assert len(scene.holds) == before, "it has not said what it is"
+    scene.discover((DRIVER, RIG))
+    assert f"more than one device: {DRIVER}, {RIG}" in scene.failure()
