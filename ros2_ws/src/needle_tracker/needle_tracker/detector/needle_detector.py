@@ -108,6 +108,8 @@ class NeedleDetector:
     ----------
     width_px : float
         Width of the needle in the image [px].
+    scales : int
+        Number of scales at which the needle can be searched for.
     """
 
     def __init__(
@@ -122,6 +124,7 @@ class NeedleDetector:
         self._search_shrink = self._shrink
         if self.width_px >= DETECTOR.coarse_width_px * self._shrink:
             self._search_shrink *= 2
+        self.scales = 1 if self._search_shrink == self._shrink else 2
         self._entry = view.project(np.zeros(3))
         self._clear_px = settings.hole_clearance * self._px_per_m
         self._backgrounds: dict[int, Map] = {}
@@ -138,7 +141,9 @@ class NeedleDetector:
         """Use an image for the next calls."""
         self._shrunk = {1: image}
 
-    def scores(self, grid: SearchGrid, seen: GridView, last_row: int) -> tuple[Map, Map]:
+    def scores(
+        self, grid: SearchGrid, seen: GridView, last_row: int, *, full_size: bool
+    ) -> tuple[Map, Map]:
         """Return the log-likelihood ratios of shaft and of an end in the cells of the first rows.
 
         Parameters
@@ -149,6 +154,8 @@ class NeedleDetector:
             Its cells in the image of this camera.
         last_row : int
             Last row to be searched.
+        full_size : bool
+            Whether to use the full size for all rows, not only near the entry.
 
         Returns
         -------
@@ -156,7 +163,7 @@ class NeedleDetector:
             For the cells up to the last row.
         """
         rows = last_row + 1
-        near = min(grid.row_of(DETECTOR.full_size_reach), rows)
+        near = rows if full_size else min(grid.row_of(DETECTOR.full_size_reach), rows)
         cells = int(grid.starts[rows])
         shaft, ends = np.empty(cells, np.float32), np.empty(cells, np.float32)
         for first, last, shrink in ((0, near, self._shrink), (near, rows, self._search_shrink)):

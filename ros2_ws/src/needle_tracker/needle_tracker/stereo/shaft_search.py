@@ -71,6 +71,8 @@ def find_shafts(
     detectors: tuple[NeedleDetector, NeedleDetector],
     least: float,
     most: float,
+    *,
+    full_size: bool = False,
 ) -> list[Shaft]:
     """Return the paths with the largest scores and distinct ends, the best first.
 
@@ -82,11 +84,13 @@ def find_shafts(
         Left and right.
     least, most : float
         Bounds of the distance of the end from the entry [m].
+    full_size : bool
+        Whether to use the full size of the images for all of them.
     """
     first, last = grid.row_of(least), grid.row_of(most)
     starts = grid.starts[: last + 2]
     left, right = (
-        detector.scores(grid, seen, last)
+        detector.scores(grid, seen, last, full_size=full_size)
         for detector, seen in zip(detectors, grid.views, strict=True)
     )
     totals, before, first_rows = _accumulated(

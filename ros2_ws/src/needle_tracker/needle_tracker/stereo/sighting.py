@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,18 +114,15 @@ class StereoSearch:
             The clearest end in the left and the right image, whether or not they meet.
         """
         grid = make_search_grid(self.views, self.settings)
-        shafts = find_shafts(grid, self.detectors, least, most)
-        # The first tip of a short needle may come from the end in one view and the shaft in both.
-        hidden = most < 2.0 * self.settings.entry_zone
         sightings: list[Sighting] = []
-        for shaft in shafts:
-            points = grid.points(shaft.cells)
-            left = self._ends(0, grid, shaft, hidden=hidden)
-            # Most shafts that are not the needle's have no end in the left image at full size.
-            right = self._ends(1, grid, shaft, hidden=hidden) if left else []
-            for ends in itertools.product(left, right):
-                if all(_differ(ends, other.ends) for other in sightings):
-                    sightings.extend(self._sightings(ends, points, least, most))
+        shafts: list[Shaft] = []
+        # Over a pattern or dull metal, some needles are visible at one of the scales only.
+        for full_size in (False, True)[: max(d.scales for d in self.detectors)]:
+            shafts = find_shafts(grid, self.detectors, least, most, full_size=full_size) or shafts
+            for shaft in shafts:
+                self._add_sightings(grid, shaft, least, most, sightings)
+            if any(sighting.evidence > 0.0 for sighting in sightings):
+                break
         if sightings:
             sightings.sort(key=lambda sighting: -sighting.evidence)
             return sightings, sightings[0].ends
@@ -148,16 +144,25 @@ class StereoSearch:
         direction = ahead / np.linalg.norm(ahead)
         return self.detectors[side].ends_near(pixels[-1], direction, hidden=hidden)
 
-    def _sightings(
-        self, ends: tuple[ImageEnd, ImageEnd], points: Array, least: float, most: float
-    ) -> Iterator[Sighting]:
-        """Yield the sighting of two ends, if they can be those of the needle."""
-        tip = triangulate(self.views, ends, points[-1])
-        if tip is None or tip.misfit > PAIRING.gate or not self.is_possible(tip, least, most):
-            return
-        before = np.linalg.norm(points, axis=1) < np.linalg.norm(tip.position)
-        length = shaft_length(np.vstack([points[before], tip.position]))
-        yield Sighting(tip, ends, evidence(ends, tip), length)
+    def _add_sightings(
+        self, grid: SearchGrid, shaft: Shaft, least: float, most: float, sightings: list[Sighting]
+    ) -> None:
+        """Add the pairs of ends near that of a shaft that can be those of the needle."""
+        # The first tip of a short needle may come from the end in one view and the shaft in both.
+        hidden = most < 2.0 * self.settings.entry_zone
+        left = self._ends(0, grid, shaft, hidden=hidden)
+        # Most shafts that are not the needle's have no end in the left image at full size.
+        right = self._ends(1, grid, shaft, hidden=hidden) if left else []
+        points = grid.points(shaft.cells)
+        for ends in itertools.product(left, right):
+            if not all(_differ(ends, other.ends) for other in sightings):
+                continue
+            tip = triangulate(self.views, ends, points[-1])
+            if tip is None or tip.misfit > PAIRING.gate or not self.is_possible(tip, least, most):
+                continue
+            before = np.linalg.norm(points, axis=1) < np.linalg.norm(tip.position)
+            length = shaft_length(np.vstack([points[before], tip.position]))
+            sightings.append(Sighting(tip, ends, evidence(ends, tip), length))
 
     def is_possible(self, tip: SpatialTip, least: float, most: float) -> bool:
         """Return whether position and direction of a tip are possible for the needle."""

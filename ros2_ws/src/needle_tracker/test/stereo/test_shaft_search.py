@@ -27,7 +27,7 @@ class KnownScores:
 
     values: Scores
 
-    def scores(self, grid: SearchGrid, seen: GridView, last_row: int) -> Scores:
+    def scores(self, grid: SearchGrid, seen: GridView, last_row: int, *, full_size: bool) -> Scores:
         cells = grid.starts[last_row + 1]
         return self.values[0][:cells], self.values[1][:cells]
 

@@ -24,19 +24,24 @@ Search = Callable[..., StereoSearch]
 
 @dataclasses.dataclass
 class SeenLines:
-    """Stand-in for a detector: the lines in a camera's view, each from the entry to its end."""
+    """Stand-in for a detector: the lines in a camera's view, each from the entry to its end.
+
+    The search at half size sees no thin lines.
+    """
 
     view: RefractedCamera
     lines: list[np.ndarray]
+    are_thin: bool = False
     ends: float = 0.95
+    scales: int = 2
 
     def scores(
-        self, grid: SearchGrid, seen: GridView, last_row: int
+        self, grid: SearchGrid, seen: GridView, last_row: int, *, full_size: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         pixels = seen.pixels[: grid.starts[last_row + 1]]
         shaft, ends = np.full(len(pixels), -1.0), np.full(len(pixels), -3.0)
         canvas = np.zeros((self.view.camera.height, self.view.camera.width), np.uint8)
-        for line in self.lines:
+        for line in self.lines if full_size or not self.are_thin else ():
             drawn = self.view.project(line)
             cv2.polylines(canvas, [np.rint(drawn).astype(np.int32)], False, 1, 10)
             ends[np.linalg.norm(pixels - drawn[-1], axis=1) < 5.0] = 6.0
@@ -61,8 +66,10 @@ def search(views: Views) -> Search:
     settings = StereoTrackerParameters(max_insertion=0.1)
     make_search_grid(views, settings)
 
-    def make(left: list[np.ndarray], right: list[np.ndarray]) -> StereoSearch:
-        detectors = SeenLines(views[0], left), SeenLines(views[1], right)
+    def make(
+        left: list[np.ndarray], right: list[np.ndarray], *, are_thin: bool = False
+    ) -> StereoSearch:
+        detectors = SeenLines(views[0], left, are_thin), SeenLines(views[1], right, are_thin)
         return StereoSearch(views, detectors, settings)  # type: ignore[arg-type]
 
     return make
@@ -81,8 +88,11 @@ def test_the_end_in_only_one_view_is_reported(search: Search, needle: np.ndarray
     assert right is None
 
 
-def test_one_needle_in_both_views_is_one_sighting(search: Search, needle: np.ndarray) -> None:
-    (sighting,) = search([needle], [needle]).search(3e-3, 0.15)[0]
+@pytest.mark.parametrize("is_thin", [False, True])
+def test_one_needle_in_both_views_is_one_sighting(
+    search: Search, needle: np.ndarray, is_thin: bool
+) -> None:
+    (sighting,) = search([needle], [needle], are_thin=is_thin).search(3e-3, 0.15)[0]
     np.testing.assert_allclose(sighting.tip.position, needle[-1], atol=0.05e-3)
     assert sighting.length == pytest.approx(0.06, abs=0.6e-3)
     assert sighting.evidence > 4.0
