@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import drive_benchmark
-import reference_loop
-import study_benchmark
+from campaign.benchmarks import drive_benchmark, reference_loop, study_benchmark
 from needle_bringup.studies.study_controllers import controller_factory
 from needle_sim.studies.study import run_study
 

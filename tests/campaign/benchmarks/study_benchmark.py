@@ -10,8 +10,8 @@ from functools import partial
 
 import numpy as np
 
-import reference_loop
-from figure_rows import Row
+from campaign.benchmarks import reference_loop
+from campaign.benchmarks.figure_rows import Row
 from needle_bringup.studies.study_controllers import controller_factory, needles_at_a_time
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.model.reachability import reachability

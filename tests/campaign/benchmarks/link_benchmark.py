@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from figure_rows import Row
+from campaign.benchmarks.figure_rows import Row
 from needle_bags.link.link_port import LinkPort
 
 _LOOPBACK = "127.0.0.1"

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import needle_tracker
+from campaign.benchmarks.figure_rows import Row
 from campaign.tracking.tracker_study import Exposure, insertion_sequence, new_tracker, track_run
-from figure_rows import Row
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration

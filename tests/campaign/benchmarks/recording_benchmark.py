@@ -13,8 +13,8 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from campaign.benchmarks.figure_rows import Row
 from campaign.trials.recording_trials import record_full_rate
-from figure_rows import Row
 from needle_bags.format.bag_writer import BagWriter, standard_topic
 from needle_bags.recording.recording import reuse_freed_memory
 

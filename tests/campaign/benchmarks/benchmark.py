@@ -6,14 +6,16 @@ import itertools
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
-import drive_benchmark
-import latency_benchmark
-import link_benchmark
-import recording_benchmark
-import study_benchmark
-import tracker_benchmark
+from campaign.benchmarks import (
+    drive_benchmark,
+    latency_benchmark,
+    link_benchmark,
+    recording_benchmark,
+    study_benchmark,
+    tracker_benchmark,
+)
+from campaign.benchmarks.figure_rows import Row
 from child_processes import ending_descendants
-from figure_rows import Row
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError

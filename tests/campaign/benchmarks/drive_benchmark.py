@@ -22,7 +22,7 @@ from typing import Any
 import can
 import numpy as np
 
-from figure_rows import Row
+from campaign.benchmarks.figure_rows import Row
 from needle_core.component import PortChange
 from needle_device_driver.cia402.backend import Cia402Drives, drive_settings
 from needle_device_driver.cia402.cia402_axis import Cia402Axis

@@ -26,10 +26,10 @@ import rclpy
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
 import needle_tracker
+from campaign.benchmarks.figure_rows import Row
 from campaign.trials.ros_rig_client import CONTROLLER_START, RosRigClient
 from campaign.trials.steered_needle import FRAME_RATE, OFFSET, steer
 from campaign.trials.trial_processes import TrialProcesses
-from figure_rows import Row
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.run.stage_timing import stage_timings
 from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter

@@ -1,0 +1,1 @@
+"""`scripts/bench`: speed and memory, relative to references of the same run."""
