@@ -91,6 +91,15 @@ class Window:
         """Return the point of the image at a pixel of the window [px]."""
         return np.asarray((pixel + self.corner + 0.5) * self.shrink - 0.5)
 
+    def part(self, box: tuple[int, ...]) -> Window | None:
+        """Return the part in a box of the shrunk image; None if the window does not cover it."""
+        x0, y0, x1, y1 = np.subtract(box, self.corner * 2).tolist()
+        height, width = self.shaft.shape
+        if min(x0, y0) < 0 or x1 > width or y1 > height:
+            return None
+        part = slice(y0, y1), slice(x0, x1)
+        return Window(self.shaft[part], self.ends[part], (box[0], box[1]), self.shrink)
+
 
 class NeedleDetector:
     """Detector of the needle in the images of one camera.
@@ -129,6 +138,8 @@ class NeedleDetector:
         self._clear_px = settings.hole_clearance * self._px_per_m
         self._backgrounds: dict[int, Map] = {}
         self._shrunk: dict[int, Image] = {}
+        # Maps of the last search at full size, which cover the regions that are examined after it.
+        self._searched: Window | None = None
 
     def set_background(self, image: Image | None) -> None:
         """Use an image as the background; None if the background is unknown."""
@@ -139,7 +150,7 @@ class NeedleDetector:
 
     def set_image(self, image: Image) -> None:
         """Use an image for the next calls."""
-        self._shrunk = {1: image}
+        self._shrunk, self._searched = {1: image}, None
 
     def scores(
         self, grid: SearchGrid, seen: GridView, last_row: int, *, full_size: bool
@@ -174,6 +185,7 @@ class NeedleDetector:
             low = np.floor(boxes[:, :2].min(axis=0)).astype(int)
             high = np.ceil(boxes[:, 2:].max(axis=0)).astype(int) + 1
             window = self._evidence(shrink, (*low, *high))
+            self._searched = window if full_size else None
             for ratios, values in zip(_log_ratios(window), (shaft, ends), strict=True):
                 _read_nearest(ratios, seen.pixels[inside], window.corner, shrink, values[inside])
         return shaft, ends
@@ -270,7 +282,9 @@ class NeedleDetector:
             return None
         first = np.floor(low / self._shrink).astype(int)
         last = np.ceil(high / self._shrink).astype(int) + 1
-        return self._evidence(self._shrink, (*first, *last))
+        box = (*first.tolist(), *last.tolist())
+        covered = self._searched and self._searched.part(box)
+        return covered or self._evidence(self._shrink, box)
 
     def _at(self, shrink: int) -> Image:
         if shrink not in self._shrunk:

@@ -153,9 +153,14 @@ def test_no_function_is_compiled_after_the_warm_up(
     assert compiled_for() == before
 
 
-def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Drawer) -> None:
+@pytest.mark.parametrize(
+    "insertions", [(0.009, 0.02), (0.08,), (0.12,), (None, None), (None, None, None)]
+)
+def test_an_absent_needle_is_never_found(
+    tracker: NeedleTracker, draw_pair: Drawer, insertions: tuple[float | None, ...]
+) -> None:
     """Sheath, hole, uneven light and noise are drawn, but no needle."""
-    for seed, insertion in enumerate((0.009, 0.02, 0.08, 0.12, None, None, None, None)):
+    for seed, insertion in enumerate(insertions):
         measured = tracker.process(*draw_pair(None, seed=seed, noise=5.0), insertion)
         assert measured.tip is None
         assert measured.reason
@@ -165,14 +170,14 @@ def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Draw
 def test_a_blocked_camera_loses_the_track_until_it_is_clear(
     tracker: NeedleTracker, draw_pair: Drawer
 ) -> None:
-    left, right = draw_pair(arc(0.05, 5.0, 1.0))
-    assert tracker.process(left, right, 0.05).state is TrackState.TRACKING
+    left, right = draw_pair(arc(0.025, 5.0, 1.0))
+    assert tracker.process(left, right, 0.025).state is TrackState.TRACKING
     blocked = np.full_like(right, 140)
-    answers = [tracker.process(left, blocked, 0.05) for _ in range(FILTER.lost_after)]
+    answers = [tracker.process(left, blocked, 0.025) for _ in range(FILTER.lost_after)]
     assert all(answer.reason == NoTip.NOTHING for answer in answers)
     assert answers[-1].state is TrackState.LOST
     assert answers[-1].tip is None
-    again = tracker.process(left, right, 0.05)
+    again = tracker.process(left, right, 0.025)
     assert again.state is TrackState.TRACKING
     assert again.tip is not None
 
