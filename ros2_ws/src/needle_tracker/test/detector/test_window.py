@@ -15,7 +15,7 @@ def test_a_part_has_the_values_at_its_place_in_the_image() -> None:
     assert part.shaft.shape == part.ends.shape == (8, 7)
     assert (part.shaft[3, 4], part.ends[3, 4]) == (shaft[5, 9], -shaft[5, 9])
     pixel = np.array([4.0, 3.0])
-    np.testing.assert_array_equal(part.point(pixel), whole.point(pixel + [5.0, 2.0]))
+    np.testing.assert_array_equal(part.point(pixel), whole.point(pixel + np.array([5.0, 2.0])))
     np.testing.assert_allclose(part.pixel(part.point(pixel)), pixel)
 
 
