@@ -121,7 +121,7 @@ class StereoSearch:
             shafts = find_shafts(grid, self.detectors, least, most, full_size=full_size) or shafts
             for shaft in shafts:
                 self._add_sightings(grid, shaft, least, most, sightings)
-            if any(sighting.evidence > 0.0 for sighting in sightings):
+            if sightings:
                 break
         if sightings:
             sightings.sort(key=lambda sighting: -sighting.evidence)
