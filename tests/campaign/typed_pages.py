@@ -135,7 +135,7 @@ class Session:
         The checkout, or a copy.
     environment : mapping
         Environment of the commands.
-    say : callable
+    log : callable
         Called with each command before it runs.
     change : callable, optional
         Changes a command before it runs, for shorter tests.
@@ -150,12 +150,12 @@ class Session:
         self,
         folder: Path,
         environment: Mapping[str, str],
-        say: Callable[[str], None],
+        log: Callable[[str], None],
         change: Callable[[str], str] = str,
     ) -> None:
         self._folder = folder
         self._environment = dict(environment)
-        self._say = say
+        self._log = log
         self._change = change
         self._nodes: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
         self._logs = Path()
@@ -220,7 +220,7 @@ class Session:
 
     def _open(self, command: str, stdin: int, output: IO[Any]) -> subprocess.Popen[bytes]:
         """Start a command in a shell with the environment of this checkout."""
-        self._say(command)
+        self._log(command)
         before = "" if "scripts/setup" in command else "source scripts/env.sh\n"
         return subprocess.Popen(
             ["bash", "-c", f"{before}{command}"],

@@ -22,7 +22,7 @@ def test_page_gets_the_reason_after_a_stall(first: str) -> None:
     scene.press(page)
     scene.wait(ECHO_AGE_LIMIT + 0.5)
     if first == "message":
-        scene.say(page, True)
+        scene.send(page, True)
     elif first == "look":
         scene.protocol.update(scene.now)
     message = scene.message_to(page)

@@ -178,7 +178,7 @@ def units(speed: int, ramp: int, more: Values, per_speed: float, per_ramp: float
 
 
 ASSUMED = "does not report its units; assumed: "
-UNTOLD = f"{ASSUMED}counts/s (0x60A9), counts/s^2 (0x60AA);"
+UNREPORTED_UNITS = f"{ASSUMED}counts/s (0x60A9), counts/s^2 (0x60AA);"
 WIDTHS = {(0x605A, 0): 1, (0x6066, 0): 4, (0x60C2, 1): 2}
 TAKEN: list[Row] = [
     (has(), {(0x6065, 0): 10_000, (0x607D, 1): -20_000, (0x607D, 2): 4_020_000}, ""),
@@ -193,8 +193,8 @@ TAKEN: list[Row] = [
     units(RPM, COUNTS_2, TURN, 20_000 / 60, 1.0),
     units(COUNTS, RPM_S, {**TURN, (0x6096, 1): 60, (0x6096, 2): 1}, 1.0, 20_000 / 60),
     (fed(100_000, 2), {(0x6085, 0): 12_000}, ""),
-    (all_of(reports(TURN), lacks(0x60A8, 0x60A9, 0x60AA)), SPEEDS | RAMPS, UNTOLD),
-    (reports({(0x60A9, 0): 0, (0x60AA, 0): 0}), SPEEDS | RAMPS, UNTOLD),
+    (all_of(reports(TURN), lacks(0x60A8, 0x60A9, 0x60AA)), SPEEDS | RAMPS, UNREPORTED_UNITS),
+    (reports({(0x60A9, 0): 0, (0x60AA, 0): 0}), SPEEDS | RAMPS, UNREPORTED_UNITS),
     (all_of(reports(IN_RPM), lacks(0x60AA)), {(0x6085, 0): 30_000}, f"{ASSUMED}the unit of its sp"),
     (
         all_of(lacks(0x60A9), reports({(0x6096, 1): 7, (0x6096, 2): 7})),
