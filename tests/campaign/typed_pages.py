@@ -3,7 +3,7 @@
     python tests/campaign/typed_pages.py [PAGE ...]       # in a fresh clone, at full length
 
 Code blocks that are indented, or fenced as `sh`, are commands; `python` is a program; `yaml NAME`,
-`toml NAME` and `python NAME` are files of that name; `text` is not typed. What goes on until
+`toml NAME` and `python NAME` are files of that name; `text` is not typed. A process that runs until
 Ctrl-C runs until the page's end, or `<!-- Ctrl-C -->`. `<!-- not typed: WHY -->` before a block
 leaves it out.
 """
@@ -48,7 +48,7 @@ READY = 60.0
 ENDS = 40.0
 INTERRUPTED = 130
 # Period of the check that nodes are alive [s].
-LOOK = 1.0
+START_CHECK_TIME = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,7 +255,7 @@ class Session:
         end = time.monotonic() + LIMIT
         while True:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                return process.wait(LOOK)
+                return process.wait(START_CHECK_TIME)
             for name, (node, log) in self._nodes.items():
                 if node.poll() is not None:
                     raise PageError(f"{command}\n{name} has ended: {log.read_text('utf-8')}")
@@ -295,7 +295,7 @@ class Session:
         """
         for name, (process, log) in list(self._nodes.items()):
             if process.poll() is not None:
-                raise PageError(f"{name} has ended by itself: {log.read_text('utf-8')}")
+                raise PageError(f"{name} has ended unexpectedly: {log.read_text('utf-8')}")
             process.send_signal(signal.SIGINT)
         for name, (process, log) in list(self._nodes.items()):
             try:

@@ -40,7 +40,7 @@ _MOST = 3
 _LATEST, _SHORTEST, _LONGEST = 3.0, 0.05, 3.0
 _DEEP_ENOUGH = 0.002
 _START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
-# Gap after which the emulated drives stood still: they publish with each SYNC of the driver [s].
+# Gap that shows that drive time was paused: they publish with each SYNC of the driver [s].
 _WITHOUT_SYNC = 0.1
 
 
@@ -192,7 +192,7 @@ def _insert(monitor: ProcessMonitor, graph: TrialProcesses, faults: Sequence[Fau
     try:
         monitor.draw_out()
     except UserError as error:
-        monitor.watch.violate("the_way_goes_on", monitor.now, str(error))
+        monitor.watch.violate("run_can_continue", monitor.now, str(error))
 
 
 def _begin(monitor: ProcessMonitor, graph: TrialProcesses, fault: Fault) -> None:

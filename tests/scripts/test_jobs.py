@@ -1,4 +1,4 @@
-"""A signal that ends a script also ends its child processes, whatever they are doing."""
+"""A signal that ends a script also ends its child processes in any state."""
 
 import os
 import signal

@@ -49,7 +49,7 @@ from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.main import run_component
 from needle_core.settings.parameter_fields import check_fields, parameter
 
-PATIENCE = 60.0  # [s]
+TIMEOUT = 60.0  # [s]
 LONGEST = 1000
 
 
@@ -197,7 +197,7 @@ class Bench:
         )
 
     def until(self, condition: Callable[[], bool]) -> None:
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while not condition():
             assert time.monotonic() < end, (self.received, self.health, self.echo.answers)
             self._executor.spin_once(timeout_sec=0.02)

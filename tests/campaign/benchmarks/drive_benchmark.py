@@ -1,4 +1,4 @@
-"""The driver's 50 Hz cycle beside stock python-can, on the same emulated drives.
+"""The driver's 50 Hz cycle compared with stock python-can, on the same emulated drives.
 
 Each client moves both axes over a pseudo-terminal; the process of the drives records when each SYNC
 arrives.

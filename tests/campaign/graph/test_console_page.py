@@ -132,7 +132,7 @@ def check_stands_still(page: Page) -> float:
     return at
 
 
-def hold_until(page: Page, press: Hand, let_go: Hand, headline: str) -> None:
+def hold_until(page: Page, press: Hand, release: Hand, headline: str) -> None:
     """Hold until the depth [mm] meets the condition, without a release.
 
     A browser that is delayed by 0.25 s on a busy machine loses the hold; the test then releases and
@@ -143,7 +143,7 @@ def hold_until(page: Page, press: Hand, let_go: Hand, headline: str) -> None:
         try:
             page.wait_for_function(f"() => ({DEPTH})() {headline}", timeout=2e3)
         except TooLate:
-            let_go()
+            release()
         else:
             return
     raise AssertionError(f"the needle does not get there: {page.locator('main').inner_text()}")

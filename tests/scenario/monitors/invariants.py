@@ -131,12 +131,12 @@ class InvariantMonitor:
         idle = at - self._pressed_until
         if pressed and idle > PAGE_LIFETIME:
             text = f"reported as held {idle:.3f} s after the finger was off"
-            self.violate("hold_is_of_now", at, text)
+            self.violate("hold_is_current", at, text)
         begins = pressed and not self._page_holds
         if begins and self._pressed_since < self._page_ended - PAGE_LIFETIME:
             since, ended = self._pressed_since, self._page_ended
             text = f"held again by a press of {since:.3f} s; its hold had ended at {ended:.3f} s"
-            self.violate("hold_is_of_now", at, text)
+            self.violate("hold_is_current", at, text)
         if self._page_holds and not pressed:
             self._page_ended = at
         self._page_holds = pressed
@@ -192,7 +192,7 @@ class InvariantMonitor:
             self.violate("none_beyond_limits", at, text)
 
     def observe_drives_go_on(self, at: float) -> None:
-        """Observe that the time of the drives stood still until now."""
+        """Observe that drive time was paused until now."""
         self._ends_until = at + WATCHDOG_BOUND
 
     def observe_motors(self, at: float, insertion: float, rotation: float) -> None:
@@ -237,7 +237,7 @@ class InvariantMonitor:
         if not -0.0005 <= off <= _BELIEF:
             measured = f"the needle is {self._before[1] * 1e3:.2f} mm in"
             text = f"the controller says {status.insertion_m * 1e3:.2f} mm, {measured}"
-            self.violate("belief_equals_joints", at, text)
+            self.violate("depth_matches_joints", at, text)
 
     # ---- checks ---------------------------------------------------------------------------------
 

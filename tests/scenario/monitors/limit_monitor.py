@@ -17,7 +17,7 @@ _SET_POINTS_BEHIND = 3
 _DEPTH_MARGIN, _ROTATION_MARGIN = 0.0011, 0.3
 # Function codes of the process data that carry controlword and mode, and the target (CiA 402).
 _CONTROL, _TARGET = 0x200, 0x300
-# Bits of the controlword that let a drive operate, and cyclic synchronous position mode.
+# Bits of the controlword that enable operation, and cyclic synchronous position mode.
 _OPERATE, _CYCLIC_POSITION = 0x0F, 8
 
 
@@ -124,7 +124,7 @@ class LimitMonitor:
     bounds : SafetyLimits
         Limits of the rig.
     late : float
-        Lateness of a set-point; the next one may follow it so much sooner [s].
+        Lateness of a set-point, by which the next interval may be shorter [s].
     """
 
     def __init__(self, bounds: SafetyLimits, late: float = 0.0) -> None:

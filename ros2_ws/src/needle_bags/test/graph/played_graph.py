@@ -27,7 +27,7 @@ def type_name(kind: type) -> str:
 
 
 def sent(number: int, data: bytes = b"", time_ns: int = 1) -> Taken:
-    """Return what a subscription takes: a message and its DDS metadata."""
+    """Return a received message and its DDS metadata."""
     names = ("source_timestamp", "received_timestamp")
     info = dict.fromkeys(names, time_ns) | {"publication_sequence_number": number}
     return data or str(number).encode(), info

@@ -177,7 +177,7 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     scene.when(15, lambda: scene.change(seek=4.0))
     scene.when(4, lambda: scene.change(seek=4.0))
     scene.when(5, lambda: scene.change(seek=11.0))
-    # The pause at 11 takes no time of the bag.
+    # Bag time stands still during the pause at 11.
     scene.when(11, lambda: scene.pause(True))
     scene.when(11, lambda: scene.at(10.0, lambda: scene.pause(False)))
     scene.when(12, lambda: scene.change(rate=1.1))

@@ -1,4 +1,4 @@
-"""Port that sends the same to all clients, whatever they send and however slowly they read."""
+"""Port that sends the same data to all clients, regardless of their input and reading speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""live_view in virtual time, with a rig played by the test and viewers that come and go."""
+"""live_view in virtual time, with a rig played by the test and viewers that start and stop."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Scene:
         elif sender == self.view.name and not isinstance(message, m.LogLine):
             self.published.append((output.topic, message))
 
-    def look_at(self, *topics: str) -> Viewer:
+    def open_viewer(self, *topics: str) -> Viewer:
         viewer = Viewer(self.view, topics)
         self.runner.start(viewer)
         self.runner.run(0.5)
@@ -143,7 +143,7 @@ def shown(markers: m.Markers) -> dict[str, m.Marker]:
 
 def test_known_quantities_are_drawn_and_the_others_deleted() -> None:
     scene = Scene()
-    received = scene.look_at(live_view.MARKERS, live_view.TIP, live_view.PATH).received
+    received = scene.open_viewer(live_view.MARKERS, live_view.TIP, live_view.PATH).received
     markers = received[live_view.MARKERS]
     status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
     scene.publish("needle/controller_status", status)
@@ -171,7 +171,7 @@ def test_known_quantities_are_drawn_and_the_others_deleted() -> None:
 def test_topics_without_subscriber_are_not_published() -> None:
     scene = steered()
     assert scene.published == []
-    scene.look_at(live_view.PATH)
+    scene.open_viewer(live_view.PATH)
     assert {topic for topic, _ in scene.published} == {live_view.PATH}
     scene.runner.stop("viewer")
     scene.runner.run(0.5)
@@ -191,7 +191,7 @@ def test_topics_without_subscriber_are_not_published() -> None:
 
 def test_implausible_messages_are_rejected() -> None:
     scene = steered()
-    markers = scene.look_at(live_view.MARKERS).received[live_view.MARKERS]
+    markers = scene.open_viewer(live_view.MARKERS).received[live_view.MARKERS]
     before = shown(markers[-1])
     for topic, message in (
         ("joint_states", inserted(1e300)),
@@ -235,7 +235,7 @@ def black(stamp_ns: int) -> m.Image:
 def test_an_image_is_drawn_with_its_answer(left_view: Projection) -> None:
     scene = steered()
     scene.publish("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-    pictures = scene.look_at(LEFT).received[LEFT]
+    pictures = scene.open_viewer(LEFT).received[LEFT]
     scene.rig.todo.append(Publish(RAW, black(2 * EXPOSED)))
     scene.publish("needle/tip_pose", pose("rig", 1e-4, 2 * EXPOSED))
     (received,) = pictures
@@ -263,7 +263,7 @@ def test_images_of_another_camera_or_before_a_subscription_are_not_shown() -> No
     scene.runner.run(0.05)
     scene.runner.stop("viewer")
     scene.publish(RAW, black(3))
-    pictures = scene.look_at(LEFT).received[LEFT]
+    pictures = scene.open_viewer(LEFT).received[LEFT]
     scene.runner.run(1.0)
     assert pictures == []
     scene.publish(RAW, m.Image(1, "", 2, 3, "mono8", 3, bytes(6)))
@@ -281,7 +281,7 @@ def test_transforms_are_published_if_the_message_type_is_installed() -> None:
     scene = Scene(transforms=True)
     assert Output(live_view.TF_STATIC, m.Transforms, LATCHED) in scene.view.outputs
     scene.publish("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-    received = scene.look_at(live_view.TF, live_view.TF_STATIC).received
+    received = scene.open_viewer(live_view.TF, live_view.TF_STATIC).received
     assert len(received[live_view.TF_STATIC]) == 1
     # Nothing is sent before there is data.
     assert received[live_view.TF] == []
@@ -298,7 +298,7 @@ def test_transforms_are_published_if_the_message_type_is_installed() -> None:
 def test_clients_receive_watched_topics_and_latched_ones_alone(left_view: Projection) -> None:
     scene, clients = Scene(foxglove_port=1), Clients()
     scene.runner.start(clients)
-    scene.look_at(live_view.PATH)
+    scene.open_viewer(live_view.PATH)
 
     def received() -> set[str]:
         clients.received.clear()

@@ -101,7 +101,7 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     return _with_file(parameters, arguments, _RESERVED_BY_SIMULATION)
 
 
-def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
+def nodes_alongside_rig(arguments: Mapping[str, str]) -> Parameters:
     """Return the nodes of rig.launch.py.
 
     Parameters

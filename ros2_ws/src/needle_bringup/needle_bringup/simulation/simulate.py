@@ -242,7 +242,7 @@ def _make_folder(options: SimulateOptions) -> Path:
 
 
 def _checkout() -> Path:
-    """Return the checkout, or the current folder of an installed package."""
+    """Return the checkout; for an installed package, the current folder."""
     with contextlib.suppress(UserError):
         return checkout()
     return Path.cwd()

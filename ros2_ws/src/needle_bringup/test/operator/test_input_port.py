@@ -107,7 +107,7 @@ HOLD, STOPPED, NOTHING = (
     InputState(speed=0.8),
 )
 # Events before each reading, and the expected reading.
-LOOKS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
+READINGS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
     # A held pedal sends nothing.
     (((KEY, DOWN), HOLD), ((), HOLD), ((KEY, UP), NOTHING)),
     # Key repeat is no press.
@@ -120,10 +120,10 @@ LOOKS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
 
 
 def test_a_reading_ignores_key_repeat() -> None:
-    for looks in LOOKS:
+    for readings in READINGS:
         pedal = PedalPort()
         assert pedal.read() == NOTHING
-        for done, wanted in looks:
+        for done, wanted in readings:
             if done:
                 pedal.do(*done)
             assert pedal.read() == wanted

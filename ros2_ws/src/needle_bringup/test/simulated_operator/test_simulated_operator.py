@@ -1,4 +1,4 @@
-"""simulated_operator: calls, holds, failures, and when it must not act."""
+"""simulated_operator: calls, holds, failures, and situations in which it must not act."""
 
 from __future__ import annotations
 
@@ -314,7 +314,7 @@ def test_an_ignored_press_is_released_and_repeated() -> None:
         scene = reach()
         if counted_before:
             scene.device(HOLDING, 1.1, hold_owner=NAME)
-        # The device has heard the release in between. On a busy machine statuses arrive late: a
+        # The device has received the release in between. On a busy machine statuses arrive late: a
         # step may be under way without one.
         for now, again in ((9.0, NAME), (9.1, ""), (9.2, "somebody"), (30.0, "")):
             scene.device(HOLDING, now, press_again=again)

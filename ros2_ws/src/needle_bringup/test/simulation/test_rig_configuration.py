@@ -104,7 +104,7 @@ def test_the_controller_knows_the_sensor_of_its_level() -> None:
 
 def test_the_launched_rig_is_that_of_simulate() -> None:
     # Beyond the defaults, simulate sets only what the command line gives, recording, and the
-    # emulated adapter: nothing of it describes the rig.
+    # emulated adapter: none of these describe the rig.
     of_run = {"level", "seed", "preset"}
     of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
     set_by_simulate = {

@@ -59,13 +59,13 @@ def test_hold_lasts_while_echoed_and_ends_with_silence(scene: Scene, page: int) 
 
 def test_hold_age_counts_from_the_sent_count(scene: Scene, page: int) -> None:
     scene.press(page)
-    begin, held_up = scene.now, []
+    begin, delayed = scene.now, []
     while scene.now + PERIOD < begin + ECHO_AGE_LIMIT:
         scene.wait(PERIOD)
-        held_up.append((scene.message(page, True), scene.now))
-    for data, _ in held_up:
+        delayed.append((scene.message(page, True), scene.now))
+    for data, _ in delayed:
         assert scene.protocol.receive(page, data, scene.now) is None
-    _, last = held_up[-1]
+    _, last = delayed[-1]
     scene.wait(last + ECHO_AGE_LIMIT - JUST - scene.now)
     assert scene.pressed
     scene.wait(2.0 * JUST)
@@ -73,15 +73,15 @@ def test_hold_age_counts_from_the_sent_count(scene: Scene, page: int) -> None:
 
 
 @pytest.mark.parametrize("holds", [True, False])
-@pytest.mark.parametrize("held_up", [[True] * 12, [False, True]])
+@pytest.mark.parametrize("delayed", [[True] * 12, [False, True]])
 def test_burst_after_a_stall_does_not_count(
-    scene: Scene, page: int, held_up: list[bool], holds: bool
+    scene: Scene, page: int, delayed: list[bool], holds: bool
 ) -> None:
     if holds:
         scene.press(page)
     else:
         scene.send(page, False)
-    messages = [scene.message(page, pressed) for pressed in held_up]
+    messages = [scene.message(page, pressed) for pressed in delayed]
     scene.wait(ECHO_AGE_LIMIT + JUST)
     for data in messages:
         assert scene.protocol.receive(page, data, scene.now) is HoldRefusal.STALE

@@ -34,10 +34,14 @@ class Rig:
         self.notices: list[str] = []
         self.asked: list[bool] = []
         self.server = HoldServer(
-            Access("127.0.0.1", 8080), 0, self.why_not, self.states.append, self.notices.append
+            Access("127.0.0.1", 8080),
+            0,
+            self.refusal_reason,
+            self.states.append,
+            self.notices.append,
         )
 
-    def why_not(self, is_local: bool) -> str:
+    def refusal_reason(self, is_local: bool) -> str:
         self.asked.append(is_local)
         return ""
 

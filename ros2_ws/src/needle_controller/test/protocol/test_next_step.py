@@ -70,7 +70,7 @@ def test_confidence_follows_from_covariance_and_miss_probability() -> None:
     assert elsewhere.is_doubtful
     wide = np.diag([1.1e-6, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert assess_confidence(dataclasses.replace(estimate, covariance=wide)).is_doubtful
-    # Without a miss probability there is no verdict.
+    # No miss probability: no verdict.
     unjudged = assess_confidence(dataclasses.replace(estimate, miss=None), 0.72)
     assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
 

@@ -24,7 +24,7 @@ _SUPERVISED = (State.DISABLED, State.HOLDING, State.MOVING)
 
 
 class DeviceCore:
-    """Executes what the motion supervisor allows, and stops the axes on a fault.
+    """Executes the motions that the supervisor allows, and stops the axes on a fault.
 
     Parameters
     ----------

@@ -56,8 +56,8 @@ class ScriptedDrive:
         self.mode = 0
         # Modes that it accepts by SDO.
         self.modes = {6, 8}
-        # Orders that it ignores; whether it answers to SYNC, and has heartbeats; counts that it
-        # moves at each SYNC by itself, in a state and while it homes.
+        # Orders that the drive ignores; whether it answers to SYNC, and has heartbeats; counts that
+        # it moves at each SYNC without an order, in a state and while it homes.
         self.ignored_orders: set[str] = set()
         self.syncs = self.beats = True
         self.drift: dict[str, int] = {}

@@ -97,7 +97,7 @@ REFUSED: list[tuple[Change, str]] = [
     (all_of(reports({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     (refuses(RANGE, 0x605A), "node 1 refuses to write 6 to 0x605A:0"),
     (refuses(RANGE, 0x605E), "node 1 refuses to write 2 to 0x605E:0"),
-    # A method to a switch is never replaced by one where the axis stands.
+    # Homing to a switch is never replaced by homing at the present position.
     (refuses(RANGE, 0x6098, but=b"\x25"), "refuses to write 17 to 0x6098:0"),
     # It happens to have the values for a drive without home.
     (
@@ -106,7 +106,7 @@ REFUSED: list[tuple[Change, str]] = [
     ),
     *(kept(0x607D, wanted, 0) for wanted in (-(2**31), 2**31 - 1)),
     *(kept(index, wanted, 5) for index, wanted in REQUIRED.items()),
-    # Neither in counts nor in rpm.
+    # Units other than counts and rpm.
     in_unit(0x60A9, 0xFD01_0300, "10^-3 m/s"),
     in_unit(0x60A9, 0x0010_0300, "rad/s"),
     in_unit(0x60A9, 0x0041_4700, "deg/min"),

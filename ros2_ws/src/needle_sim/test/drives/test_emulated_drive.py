@@ -128,7 +128,7 @@ def test_the_next_profile_target_waits_for_the_first_and_a_relative_one_adds(
 @pytest.mark.parametrize("start", [2_345.5, -1.0, -5_000.0])
 def test_homing_finds_the_edge_of_the_switch(start: float) -> None:
     master = Master(start=start)
-    # It counts from its position at power-up.
+    # The drive counts from its position at power-up.
     assert master.read(0x6064) == 0
     master.home()
     # It rests a braking distance off the edge and counts from the edge.

@@ -15,7 +15,7 @@ SPEED, RAMP = 32768, 82
 
 
 class Chain:
-    """A computer on a chain whose insertion device stands 1 mm from its home sensor."""
+    """A computer on a chain whose insertion device is 1 mm from its home sensor."""
 
     def __init__(self, **motor: float) -> None:
         insertion = MotorSettings(

@@ -58,7 +58,7 @@ def test_link_loss_while_idle_and_before_the_set_up() -> None:
         bench.link.send(0x80)
 
 
-# ---- answers that do not come, or late ----------------------------------------------------------
+# ---- missing and late answers -------------------------------------------------------------------
 
 
 def test_reply_age_heartbeats_renew_only_answered_positions() -> None:
@@ -156,7 +156,7 @@ def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
     assert bench.drives.health("").message == "connected"
 
 
-# ---- a drive that starts anew -------------------------------------------------------------------
+# ---- a drive that restarts ----------------------------------------------------------------------
 
 
 def test_drive_reboot_of_a_self_starting_drive_needs_a_new_set_up() -> None:

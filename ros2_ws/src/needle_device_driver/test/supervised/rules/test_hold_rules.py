@@ -170,7 +170,7 @@ def test_hold_one_owner_until_released() -> None:
     bench = enabled()
     assert send_holds(bench, "a+ b+") == "a a"
     assert bench.rule == "hold_one_owner"
-    # A press beside the owner does not count later; one after an own release does.
+    # A press during another source's hold never counts; a press after its own release does.
     assert send_holds(bench, "b+ a- b+ b- b+") == "a - - - b"
 
 
