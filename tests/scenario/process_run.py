@@ -199,7 +199,7 @@ def _begin(monitor: ProcessMonitor, graph: TrialProcesses, fault: Fault) -> None
     if graph.nodes[fault.part].exit_code is not None:
         return
     if fault.part == "device_driver":
-        monitor.watch.observe_driver(monitor.now, speaks=False)
+        monitor.watch.observe_driver(monitor.now, responsive=False)
     if fault.kind is Kind.OFF:
         graph.kill(fault.part)
     else:
@@ -212,4 +212,4 @@ def _end(monitor: ProcessMonitor, graph: TrialProcesses, fault: Fault) -> None:
     else:
         graph.signal(fault.part, signal.SIGCONT)
     if fault.part == "device_driver":
-        monitor.watch.observe_driver(monitor.now, speaks=True)
+        monitor.watch.observe_driver(monitor.now, responsive=True)

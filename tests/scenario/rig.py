@@ -172,7 +172,7 @@ class SoakRig:
 
     @property
     def now(self) -> float:
-        """Virtual time since the begin [s]."""
+        """Virtual time since the start [s]."""
         return self.runner.now
 
     @property
@@ -204,7 +204,7 @@ class SoakRig:
                 self.recorders[-1].cut(self.now)
 
     def processes_of(self, name: str) -> tuple[str, ...]:
-        """Return the components that are one process with a node: the console has two."""
+        """Return the components that share a process with a node; the console has two."""
         return _CONSOLE if name == CONSOLE else (name,)
 
     def record(self) -> None:

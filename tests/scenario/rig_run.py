@@ -93,7 +93,7 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     at_page = any(fault.part in _AT_PAGE for fault in faults)
     rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH, at_page=at_page)
     if any(fault.part == of.SECOND_PERSON for fault in faults):
-        # Their joystick must be received neutral before it counts.
+        # Their joystick must report neutral once before it counts.
         for name in SECOND:
             rig.start(name)
     of_recording = [fault for fault in faults if fault.part in (of.RECORDER, of.DISK)]
@@ -148,7 +148,7 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
     def observe_motors(now: float, at: Motors) -> None:
         rig.digest.update(_rounded((at.insertion, at.rotation)))
         watch.observe_hand(now, holds=rig.hand_presses)
-        watch.observe_driver(now, speaks=rig.runner.is_responsive("device_driver"))
+        watch.observe_driver(now, responsive=rig.runner.is_responsive("device_driver"))
         watch.observe_motors(now, at.insertion, at.rotation)
         if rig.recorders:
             watch.observe_waiting(now, rig.recorders[-1].recording.bytes_waiting)

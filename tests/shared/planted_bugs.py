@@ -221,7 +221,7 @@ _MENDED: dict[str, tuple[str, Plant]] = {
         "run_can_continue",
         set_to(cia402_axis, StuckFaultError=NEVER_RAISED),
     ),
-    "an_adapter_lost_as_drives_say_who_they_are": (
+    "an_adapter_lost_during_identification": (
         "no_node_crashes",
         set_to(device_driver, LinkError=NEVER_RAISED),
     ),
@@ -229,11 +229,11 @@ _MENDED: dict[str, tuple[str, Plant]] = {
         "run_can_continue",
         wrapped(DeviceDriver, "_set_up_drives", _unless_stopped),
     ),
-    "blocked_when_the_hold_is_let_go": (
+    "blocked_at_the_release_of_the_hold": (
         "no_motion_without_hold",
         wrapped(DriveMachine, "update", _unaware),
     ),
-    "a_drive_starts_anew_within_its_set_up": (
+    "a_drive_restarts_during_its_set_up": (
         "run_can_continue",
         wrapped(cia402_axis, "await_start", _forgetful),
     ),
@@ -246,7 +246,7 @@ _MENDED: dict[str, tuple[str, Plant]] = {
         "no_motion_without_hold",
         _monitor_forgets(_homing_until=-1.0),
     ),
-    "a_rebooted_drive_is_homed_where_it_stands": (
+    "a_rebooted_drive_is_homed_at_its_position": (
         "turns_as_commanded",
         _monitor_forgets(_zero=0.0),
     ),

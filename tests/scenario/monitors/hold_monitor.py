@@ -78,7 +78,7 @@ class HoldMonitor:
         for sender in tuple(self._presses):
             self._end(sender, at)
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Reset, as a restarted device does."""
         self._presses.clear()
 

@@ -172,13 +172,13 @@ class InvariantMonitor:
             ahead = [point for point in points if point[0] > insertion] or points[-1:]
             self._commands.append(((insertion, rotation - self._zero), *ahead))
 
-    def observe_driver(self, at: float, *, speaks: bool) -> None:
+    def observe_driver(self, at: float, *, responsive: bool) -> None:
         """Observe whether the driver runs and is connected to its drives."""
-        if not speaks and self._silent_since is None:
+        if not responsive and self._silent_since is None:
             self.hold_monitor.lose_device(at)
-        self._silent_since = None if speaks else self._silent_since or at
-        if not speaks:
-            self.hold_monitor.forget()
+        self._silent_since = None if responsive else self._silent_since or at
+        if not responsive:
+            self.hold_monitor.reset()
             # A restarted driver has not received it, and starts disabled.
             self._estop_since = None
 
@@ -228,7 +228,7 @@ class InvariantMonitor:
             self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
 
     def observe_belief(self, at: float, status: ControllerStatus, *, joints_known: bool) -> None:
-        """Observe a published needle/controller_status, while joints reach the controller."""
+        """Observe a needle/controller_status published while joints reach the controller."""
         # Before its first step the controller has only the earlier position of the needle.
         steers = status.state == "STEERING" and status.step != 0
         if not (steers and joints_known) or self._before is None:
@@ -236,7 +236,7 @@ class InvariantMonitor:
         off = self._before[1] - status.insertion_m
         if not -0.0005 <= off <= _BELIEF:
             measured = f"the needle is {self._before[1] * 1e3:.2f} mm in"
-            text = f"the controller says {status.insertion_m * 1e3:.2f} mm, {measured}"
+            text = f"the controller reports {status.insertion_m * 1e3:.2f} mm, {measured}"
             self.violate("depth_matches_joints", at, text)
 
     # ---- checks ---------------------------------------------------------------------------------

@@ -73,9 +73,9 @@ class SpeedBudget:
 
     def __init__(self, speed: float) -> None:
         self._speed = speed
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Reset; the next position is the first one."""
         self._least = {1.0: math.inf, -1.0: math.inf}
 
@@ -160,7 +160,7 @@ class LimitMonitor:
         """
         its = self._axes[axis]
         if position is None:
-            its.set_points.forget()
+            its.set_points.reset()
             return
         ahead, bound = its.set_points.ahead(at, position), its.speed * self._early
         if ahead > bound:

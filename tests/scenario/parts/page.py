@@ -42,7 +42,7 @@ class PageMessage:
 @dataclasses.dataclass
 class _Press:
     mode: str
-    # Newest count at its begin.
+    # Newest count at its start.
     after: int
 
 
@@ -98,7 +98,7 @@ class Page(Component):
     # ---- the connection -------------------------------------------------------------------------
 
     def _handle_batch(self, batch: Sequence[PageMessage], at: Moment) -> Actions:
-        # Sample the finger first, as a browser does that was suspended.
+        # Sample the finger first, as a resumed browser does.
         yield from self._update_finger()
         for message in batch:
             if message.connection != self._connection:
