@@ -1,4 +1,4 @@
-"""README and docs, executed word for word on the simulated rig, with shorter insertions."""
+"""README and docs, executed verbatim on the simulated rig, with shorter insertions."""
 
 from __future__ import annotations
 

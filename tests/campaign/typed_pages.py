@@ -1,4 +1,4 @@
-"""Executes the code blocks of the pages, word for word and in order, and reports failures.
+"""Executes the code blocks of the pages, verbatim and in order, and reports failures.
 
     python tests/campaign/typed_pages.py [PAGE ...]       # in a fresh clone, at full length
 

@@ -88,8 +88,8 @@ class Scene:
         """Reason that the page gives for the end of the last hold."""
         return str(self.tab.run("needleHold.status.why"))
 
-    def never_pressed(self, press: Callable[[], None]) -> bool:
-        """Press, and return whether the hold counts."""
+    def press_is_ignored(self, press: Callable[[], None]) -> bool:
+        """Press, and return whether the press is ignored."""
         self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
         before = len(self.states)
         press()
@@ -162,7 +162,7 @@ def test_a_removed_button_or_page_ends_its_hold(scene: Scene) -> None:
     scene.tab.release_space()
 
 
-def test_a_stalled_page_says_so_until_the_next_press(scene: Scene) -> None:
+def test_a_stalled_page_reports_it_until_the_next_press(scene: Scene) -> None:
     tab = scene.tab
     scene.hold_pointer()
     tab.run("const end = performance.now() + 500; while (performance.now() < end);")
@@ -178,17 +178,17 @@ def test_a_stalled_page_says_so_until_the_next_press(scene: Scene) -> None:
 def test_other_events_than_a_press_do_not_hold(scene: Scene) -> None:
     tab = scene.tab
     tab.release_space()
-    assert scene.never_pressed(lambda: tab.press_space(repeat=True))
+    assert scene.press_is_ignored(lambda: tab.press_space(repeat=True))
     tab.release_space()
     tab.run("document.querySelector('input').focus()")
-    assert scene.never_pressed(tab.press_space)
+    assert scene.press_is_ignored(tab.press_space)
     tab.release_space()
     tab.run("document.activeElement.blur()")
     tab.run("document.querySelector('[data-hold]').ariaDisabled = 'true'")
-    assert scene.never_pressed(lambda: tab.press_pointer(*BUTTON))
+    assert scene.press_is_ignored(lambda: tab.press_pointer(*BUTTON))
     tab.release_pointer(*BUTTON)
-    assert scene.never_pressed(tab.press_space)
+    assert scene.press_is_ignored(tab.press_space)
     tab.release_space()
     tab.run("document.querySelector('[data-hold]').ariaDisabled = 'false'")
-    assert scene.never_pressed(lambda: tab.press_pointer(*ELSEWHERE))
+    assert scene.press_is_ignored(lambda: tab.press_pointer(*ELSEWHERE))
     tab.release_pointer(*ELSEWHERE)

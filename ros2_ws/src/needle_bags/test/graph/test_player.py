@@ -188,7 +188,7 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     assert len(scene.published["/plane"]) == 1 + 4
 
 
-def test_beside_a_rig_everything_is_played_under_replay(scene: Scene) -> None:
+def test_on_a_graph_with_a_rig_everything_is_played_under_replay(scene: Scene) -> None:
     scene.at(1.5, lambda: scene.offer("/device/status", DiagnosticStatus, node="device_driver"))
     assert scene.play("--clock") == 0
     assert any("playing under /replay" in line for line in scene.logged)

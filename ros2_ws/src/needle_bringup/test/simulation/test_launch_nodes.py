@@ -11,7 +11,7 @@ import yaml
 from needle_bringup.simulation.launch_nodes import (
     nodes_alongside_rig,
     refuse_misspelt,
-    replay_words,
+    replay_arguments,
     replayed_nodes,
     simulated_nodes,
 )
@@ -125,10 +125,10 @@ def test_an_existing_bag_is_played_for_viewers(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").touch()
     arguments = {"bag": str(tmp_path), "rate": "0.5", "start": "2.0", "loop": "true"}
     assert replayed_nodes(arguments) == {"player": {}, "live_view": {}}
-    words = replay_words({**arguments, "namespace": "/first"})
-    assert words["player"] == [str(tmp_path), "--rate", "0.5", "--start", "2.0", "--loop"]
+    by_node = replay_arguments({**arguments, "namespace": "/first"})
+    assert by_node["player"] == [str(tmp_path), "--rate", "0.5", "--start", "2.0", "--loop"]
     # Topics that control a rig are played only under /replay.
-    assert "target_plane:=/replay/first/target_plane" in words["live_view"]
+    assert "target_plane:=/replay/first/target_plane" in by_node["live_view"]
 
 
 def test_a_misspelt_argument_is_named() -> None:

@@ -1,4 +1,4 @@
-"""Drawn training samples: they show what was requested."""
+"""Drawn training samples match the request."""
 
 from __future__ import annotations
 

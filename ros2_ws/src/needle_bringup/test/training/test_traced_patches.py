@@ -50,7 +50,7 @@ def test_a_patch_at_the_border_is_whole(place: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize("width_px", [4.0, 10.0])
-def test_a_sample_and_its_labels_are_rotated_and_scaled_alike(width_px: float) -> None:
+def test_a_sample_and_its_labels_are_rotated_and_scaled_together(width_px: float) -> None:
     with_needle = ends = 0
     scene = bars(width_px)
     for seed in range(40):

@@ -115,6 +115,6 @@ def test_foreign_pages_are_refused_and_counted(rig: Rig) -> None:
     assert rig.notices == [f"hold: {kind}" for kind in counts]
 
 
-def test_taken_port_is_reported(rig: Rig) -> None:
+def test_a_port_in_use_is_reported(rig: Rig) -> None:
     with pytest.raises(UserError, match=rf"cannot listen on 127.0.0.1:{rig.server.port}: "):
         HoldServer(Access("127.0.0.1", 8080), rig.server.port, lambda _: "", print, print)

@@ -73,8 +73,8 @@ class PointLawSettings(NamedTuple):
 def write_lateral_offset(target: Array, need: Array) -> float:
     """Write the lateral offset that the arc to a target has to cover; return its length [m].
 
-    The arc may have any curvature. For a target beside or behind the tip the length is the distance
-    ahead, <= 0.
+    The arc may have any curvature. For a target next to or behind the tip, the length is the
+    distance ahead, <= 0.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ def test_the_need_of_a_point_is_the_bending_of_its_arc() -> None:
         assert write_lateral_offset(tip_in_start, need) == pytest.approx(length)
         # Towards -y, the direction in which an unturned bevel bends.
         np.testing.assert_allclose(need, [0.0, -0.5 * curvature * length**2], atol=1e-12)
-    # A point beside or behind the tip needs no bending and is passed.
+    # A point next to or behind the tip needs no bending and is passed.
     assert write_lateral_offset(np.array([0.001, 0.0, -0.002]), need) == -0.002
     np.testing.assert_array_equal(need, 0.0)
     assert write_lateral_offset(np.array([0.0, 0.0, 0.05]), need) == 0.05

@@ -93,14 +93,14 @@ def test_a_target_at_rest_or_hardly_observed_is_predicted_exactly_at_its_last_po
     np.testing.assert_allclose(walking.at(60.0), walking.last, atol=1e-5)
 
 
-def test_the_prediction_restarts_when_time_goes_back() -> None:
+def test_the_prediction_restarts_when_time_is_set_back() -> None:
     motion = seen(sine(0.2), 25.0)
     for time in np.arange(3.0, 13.0, 0.25):
         motion.observe(float(time), drift(float(time)))
     np.testing.assert_allclose(motion.at(15.0), drift(15.0), atol=1e-4)
 
 
-def test_a_motion_is_predicted_whatever_its_shape_and_clock() -> None:
+def test_a_motion_is_predicted_for_any_shape_and_clock() -> None:
     for path, begin in itertools.product((drift, sine(0.12), sine(0.33), chest(0.2)), (0.0, 1.7e9)):
         motion = seen(path, 25.0, begin=begin)
         for time in (26.0, 30.0, 35.0):

@@ -71,8 +71,8 @@ def test_confidence_follows_from_covariance_and_miss_probability() -> None:
     wide = np.diag([1.1e-6, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert assess_confidence(dataclasses.replace(estimate, covariance=wide)).is_doubtful
     # No miss probability: no verdict.
-    unjudged = assess_confidence(dataclasses.replace(estimate, miss=None), 0.72)
-    assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
+    without_probability = assess_confidence(dataclasses.replace(estimate, miss=None), 0.72)
+    assert (without_probability.verdict, without_probability.is_doubtful) == ("", False)
 
 
 def test_the_miss_probability_of_a_point_is_its_frequency() -> None:

@@ -75,7 +75,7 @@ class Scene:
 
 
 @pytest.mark.parametrize("pace", [0.5, 1.0, 4.0])
-def test_virtual_time_goes_at_the_pace_of_the_wall_clock(pace: float) -> None:
+def test_virtual_time_runs_at_the_pace_of_the_wall_clock(pace: float) -> None:
     scene = Scene(pace)
     begin = scene.wall.now
     for _ in range(3):

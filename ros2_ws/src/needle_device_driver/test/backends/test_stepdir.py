@@ -38,7 +38,7 @@ class Board(ProtocolBench[StepdirProtocol]):
         self.receive(b"$%s*%02X\n" % (body, checksum))
 
 
-def test_the_set_up_switches_off_and_tells_ramp_switch_and_dead_man() -> None:
+def test_the_set_up_switches_off_and_sends_ramp_switch_and_dead_man() -> None:
     board = Board(watchdog=0.15, rotation_reverse=True)
     assert board.run(board.protocol.identify()) == "stepdir 1"
     board.set_up()

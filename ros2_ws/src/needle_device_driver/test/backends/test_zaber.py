@@ -147,7 +147,7 @@ def test_each_request_asks_for_positions_and_one_slow_state() -> None:
 
 
 @pytest.mark.parametrize(("method", "asks"), [(17, True), (37, False)])
-def test_a_rotation_homed_where_it_stands_has_no_switches(method: int, asks: bool) -> None:
+def test_a_rotation_homed_at_its_position_has_no_switches(method: int, asks: bool) -> None:
     line = Line(rotation_homing_method=method)
     line.run(line.protocol.set_up("rotation"))
     assert ("2 1 get limit.home.state" in line.commands) is asks

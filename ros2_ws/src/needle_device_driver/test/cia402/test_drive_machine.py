@@ -148,7 +148,7 @@ def test_axis_that_never_rests_is_switched_off(
 ) -> None:
     enabled(machine)
     machine.set_goal(Goal.OFF)
-    # Jitter, which is no motion.
+    # Jitter does not count as motion.
     given = orders(machine, *(state(QUICK_STOP, 8 + 8 * (count % 2)) for count in range(51)))
     assert given == [DriveCommand.QUICK_STOP] * 50 + [DriveCommand.DISABLE_VOLTAGE]
 

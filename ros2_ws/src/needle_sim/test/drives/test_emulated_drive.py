@@ -37,7 +37,7 @@ def run_at(master: Master, counts_per_sync: int) -> int:
 # ---- the power state ---------------------------------------------------------------------------
 
 
-def test_the_power_state_goes_where_the_standard_says() -> None:
+def test_the_power_state_follows_the_standard() -> None:
     for state in PowerState:
         assert tuple(next_state(state, word).value for word in WORDS) == WAYS[state.value]
 
@@ -219,7 +219,7 @@ def test_switching_off_brakes_first(
     assert master.read(0x6064) - before == pytest.approx(1600, abs=1)
 
 
-def test_halt_stops_and_its_release_goes_on(master: Master) -> None:
+def test_halt_stops_and_its_release_resumes(master: Master) -> None:
     master.enable(PP)
     master.target(10_000)
     master.control(0x1F)

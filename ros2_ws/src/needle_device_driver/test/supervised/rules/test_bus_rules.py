@@ -71,7 +71,7 @@ def test_reply_age_heartbeats_renew_only_answered_positions() -> None:
     bench.insertion.syncs = False
     bench.wait(8)
     assert (bench.state, bench.rule) == ("FAULT", "reply_age")
-    # Heartbeats in another state than operational do not count.
+    # Heartbeats in any state but operational do not count.
     bench = DriveBench().configured()
     bench.insertion.nmt = 0x7F
     bench.now += 0.2

@@ -271,7 +271,7 @@ def test_hold_in_order_remembers_sixteen_sessions_per_source() -> None:
     assert send_holds(bench, "a/t16#1- a/s#1- a/s#2+ b/s#1- b/t#1- a/s#3+") == "- - a a a a"
 
 
-# ---- what a reset accepts again -----------------------------------------------------------------
+# ---- holds accepted after a reset ---------------------------------------------------------------
 
 
 def test_hold_in_order_reset_accepts_lower_stamps_without_session() -> None:
