@@ -119,7 +119,7 @@ class ProcessMonitor(RosRigClient):
         at = self.positions[-1]
         moved_at = at.time - self._begun
         if at.time - before > _WITHOUT_SYNC:
-            self.watch.observe_drives_go_on(moved_at)
+            self.watch.observe_drives_resumed(moved_at)
         if self._received_hold:
             self.watch.observe_motors(moved_at, at.insertion, at.rotation)
 

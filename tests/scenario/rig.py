@@ -249,14 +249,14 @@ class SoakRig:
         self._adapter_is_open = False
         driver = DeviceDriver(DeviceDriverParameters(link="virtual", channel="soak"))
         driver.inputs = tuple(
-            dataclasses.replace(row, handler=partial(self._take_hold, row.handler))
+            dataclasses.replace(row, handler=partial(self._receive_hold, row.handler))
             if row.topic == HOLD
             else row
             for row in driver.inputs
         )
         return driver
 
-    def _take_hold(self, handler: Any, message: HoldState, at: Any) -> Any:
+    def _receive_hold(self, handler: Any, message: HoldState, at: Any) -> Any:
         self.on_hold_received(message, at.steady)
         return handler(message, at)
 

@@ -193,7 +193,7 @@ def _watch_set_points(rig: SoakRig, watch: InvariantMonitor) -> None:
 
     def watch_frames(batch: Sequence[Any]) -> None:
         for frame in batch:
-            if (set_point := frames.take(frame.identifier, frame.data)) is not None:
+            if (set_point := frames.decode_set_point(frame.identifier, frame.data)) is not None:
                 node, position = set_point
                 watch.observe_set_point(rig.now, axes[node], position)
 

@@ -34,7 +34,7 @@ class BagMonitor:
         # Reception times by topic [s].
         self._taken: defaultdict[str, list[float]] = defaultdict(list)
 
-    def take(self, at: float, topic: str) -> None:
+    def record(self, at: float, topic: str) -> None:
         """Record the reception of a message at a time [s]."""
         self._taken[topic].append(at)
 

@@ -191,7 +191,7 @@ class InvariantMonitor:
         for text in self._limits.observe_set_point(at, axis, place):
             self.violate("none_beyond_limits", at, text)
 
-    def observe_drives_go_on(self, at: float) -> None:
+    def observe_drives_resumed(self, at: float) -> None:
         """Observe that drive time was paused until now."""
         self._ends_until = at + WATCHDOG_BOUND
 

@@ -34,7 +34,7 @@ class SetPointFrames:
         self._counts_per_unit = counts_per_unit
         self._operates = dict.fromkeys(counts_per_unit, False)
 
-    def take(self, identifier: int, data: bytes) -> tuple[int, float | None] | None:
+    def decode_set_point(self, identifier: int, data: bytes) -> tuple[int, float | None] | None:
         """Return the node id and the set-point of a drive.
 
         Parameters

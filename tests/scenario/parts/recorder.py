@@ -212,7 +212,7 @@ class RecorderStandIn(Component):
     def _receive(self, topic: str, message: Any, at: Moment) -> Actions:
         self._now = at.steady
         self._count += 1
-        self._monitor.take(at.steady, topic)
+        self._monitor.record(at.steady, topic)
         data = repr(message).encode()
         self.recording.append(Received(topic, data, at.stamp_ns, at.sent_ns, self._count))
         return ()

@@ -193,16 +193,16 @@ def test_a_moving_point_is_reached_if_its_clock_is_known() -> None:
     for apart in (0.0, 1.7e9, None):
         needle = Needle(TO_POINT)
 
-        def see(_: int, needle: Needle = needle, apart: float | None = apart) -> None:
+        def observe(_: int, needle: Needle = needle, apart: float | None = apart) -> None:
             if apart is None:
                 needle.control.target_point = breathing(needle.time)
             else:
                 needle.control.observe_target_point(breathing(needle.time), needle.time + apart)
 
-        needle.steer(30, before=see)
+        needle.steer(30, before=observe)
         ends.append(needle.tip)
         if apart == 0.0:
-            needle.steer(before=see)
+            needle.steer(before=observe)
             assert needle.off(breathing(needle.time)) < 0.0006
     # With stamps of another clock, the last observed position is used.
     np.testing.assert_array_equal(ends[1], ends[2])

@@ -105,7 +105,7 @@ class ScriptedDrive:
     def statusword(self) -> int:
         return self.STATES[self.state] | self.more_status
 
-    def take(self, cob_id: int, data: bytes) -> None:
+    def receive(self, cob_id: int, data: bytes) -> None:
         if cob_id == 0x600 + self.node:
             if self.nmt != 0x04:
                 self.sdo(data)
@@ -263,7 +263,7 @@ class ScriptedBus:
         self.sending()
         self.sent.append((cob_id, data))
         for drive in self.drives:
-            drive.take(cob_id, data)
+            drive.receive(cob_id, data)
         if not self.late:
             self.flush()
 

@@ -95,18 +95,18 @@ def test_reply_age_includes_late_answers(
 ) -> None:
     bench = DriveBench().ready()
     drive, at, worst, most = bench.insertion, 0, 0.0, 0
-    take, sync = drive.take, drive.sync
+    receive, sync = drive.receive, drive.sync
 
     def without_heartbeats(cob_id: int, data: bytes) -> None:
         # A heartbeat does not replace an answer.
-        drive.emit(0x700, bytes([drive.nmt])) if cob_id == 0x77F else take(cob_id, data)
+        drive.emit(0x700, bytes([drive.nmt])) if cob_id == 0x77F else receive(cob_id, data)
 
     def noted() -> None:
         nonlocal at
         at = drive.position
         sync()
 
-    drive.take, drive.sync = without_heartbeats, noted  # type: ignore[method-assign]
+    drive.receive, drive.sync = without_heartbeats, noted  # type: ignore[method-assign]
     for number in range(cycles):
         drive.answers_late = late(number)
         most = max(most, drive.answers_late)
