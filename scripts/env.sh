@@ -52,13 +52,13 @@ _needle_env() {
     export PATH
     # Without it, an int in a float field is sent as garbage, silently.
     export ROS_PYTHON_CHECK_FIELDS=1
-    # No packet leaves this machine, and none comes in, unless asked for.
+    # By default, no packet leaves or enters this machine.
     export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
     if [ "${RMW_IMPLEMENTATION:-rmw_fastrtps_cpp}" != rmw_fastrtps_cpp ]; then
         echo "env.sh: RMW_IMPLEMENTATION=$RMW_IMPLEMENTATION ignored: the rig's nodes run on rmw_fastrtps_cpp" >&2
     fi
     export RMW_IMPLEMENTATION=rmw_fastrtps_cpp
-    # Shared memory that holds camera images; who may ask. Every node of ours chooses in the same way.
+    # Profile with shared memory for camera images and the discovery range; all nodes of the rig select it the same way.
     case "$ROS_AUTOMATIC_DISCOVERY_RANGE" in
         LOCALHOST | OFF) profiles=needle_fastdds.xml ;;
         *) profiles=needle_fastdds_network.xml ;;
@@ -92,7 +92,7 @@ unset -f _needle_env _needle_prepend
 unset _needle_file
 if [ "$_needle_code" -ne 0 ]; then
     unset _needle_code
-    # Only a shell that is sourcing this can return; a script that runs it ends.
+    # A shell that sources this file can return; a script that runs it must exit.
     return 1 2>/dev/null || exit 1
 fi
 unset _needle_code

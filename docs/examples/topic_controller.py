@@ -1,8 +1,8 @@
-"""A controller from topics alone: tips in, steps out, nothing of needle_controller in it.
+"""A controller that uses only topics: receives tips, publishes steps, needs no needle_controller.
 
-It stands in plane_controller's place beside sim_rig, which tells it the tip, and the stand-in for a
-person, which starts it. A line through the last tips says where the needle is headed; the bevel is
-turned up or down by how far that is from where it should be headed. All is SI; x is up, z ahead.
+It replaces plane_controller: sim_rig publishes the tips, and simulated_operator starts it. A line
+through the last tips gives the heading of the needle; the bevel is turned up or down in proportion
+to the heading error. All is SI; x is up, z ahead.
 """
 
 import contextlib
@@ -20,11 +20,11 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 PLANE, DEPTH, STEP, SPEED = 0.003, 0.12, 0.001, 0.002  # x of the plane; a step and its speed
-LOOK_BACK, LEVEL_OUT, GAIN = 0.02, 0.04, 10.0  # tips that count; where the plane is aimed at
+LOOK_BACK, LEVEL_OUT, GAIN = 0.02, 0.04, 10.0  # length of tips in the fit; distance to aim at
 MOST_TURN, JOINTS = (
     0.5,
     ["insertion_joint", "rotation_joint"],
-)  # of the base in a step; what is moved
+)  # largest rotation of the base in a step
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -34,7 +34,7 @@ class TopicController(Node):
     def __init__(self):
         super().__init__("plane_controller")
         self.starts, self.joints, self.tips = 0, [0.0, 0.0], []
-        self.seen = self.after = 0  # stamps: the newest tip's, and what the next must be newer than
+        self.seen = self.after = 0  # stamps of the newest tip and of the last motion
         self.commands = self.create_publisher(JointTrajectory, "device/joint_trajectory", 10)
         self.status = self.create_publisher(DiagnosticStatus, "needle/controller_status", LATCHED)
         self.create_subscription(JointState, "joint_states", self.on_joints, 10)

@@ -1,4 +1,4 @@
-"""Compile what the nodes and studies run compiled, so that a first run does not wait for it.
+"""Compile the numerical code of nodes and studies, so that a first run need not wait.
 
 `scripts/setup` runs this after a build, one process for each part. Nodes that find nothing compiled
 (other sources, another machine) do it themselves when they start.

@@ -29,7 +29,7 @@ MARK = "NEEDLE_VERIFICATION"
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """One required figure beside the measured one.
+    """A required figure and the measured one.
 
     Attributes
     ----------

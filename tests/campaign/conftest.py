@@ -10,7 +10,7 @@ CAMPAIGN = Path(__file__).parent
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave the campaign out unless the command line asks for it."""
+    """Ignore the campaign unless the command line names it."""
     return None if config.getoption("markexpr") == "campaign" else True
 
 

@@ -1,4 +1,4 @@
-"""README and docs, executed word for word on the simulated rig, with shorter insertions."""
+"""README and docs, executed verbatim on the simulated rig, with shorter insertions."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
         if "plane_controller" in command:
             return f"{command} -p depth:=0.00{SHORT_MM}"
         if re.search(r"ros2 run \S+ (device_driver|drive_emulator) ", command):
-            # In real time, whatever else runs here: a rig gives its driver a machine that is not
+            # In real time even on a busy machine: a rig gives its driver a machine that is not
             # busy. Without the right to raise its priority, it runs with the normal one.
             return f"nice -n -10 {command}"
         if "pip install" in command:

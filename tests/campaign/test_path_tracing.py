@@ -115,9 +115,9 @@ def test_the_same_seed_gives_the_same_pairs_with_a_needle_in_them(mitsuba: Mitsu
 
 
 def test_the_command_fills_a_folder(mitsuba: Mitsuba, tmp_path: Path) -> None:
-    words = ["--renderer", "path_traced", "--appearance", "absent", "--frames", "1"]
+    argv = ["--renderer", "path_traced", "--appearance", "absent", "--frames", "1"]
     output = tmp_path / "out"
-    assert main(["--output", str(output), "--calibration", str(CALIBRATION), *words]) == 0
+    assert main(["--output", str(output), "--calibration", str(CALIBRATION), *argv]) == 0
     with (output / "truth.csv").open(encoding="utf-8", newline="") as stream:
         (row,) = csv.DictReader(stream)
     assert row["axis_x_mm"] == row["needle"] == ""

@@ -1,9 +1,9 @@
-"""Executes the code blocks of the pages, word for word and in order, and reports failures.
+"""Executes the code blocks of the pages, verbatim and in order, and reports failures.
 
     python tests/campaign/typed_pages.py [PAGE ...]       # in a fresh clone, at full length
 
 Code blocks that are indented, or fenced as `sh`, are commands; `python` is a program; `yaml NAME`,
-`toml NAME` and `python NAME` are files of that name; `text` is not typed. What goes on until
+`toml NAME` and `python NAME` are files of that name; `text` is not typed. A process that runs until
 Ctrl-C runs until the page's end, or `<!-- Ctrl-C -->`. `<!-- not typed: WHY -->` before a block
 leaves it out.
 """
@@ -48,7 +48,7 @@ READY = 60.0
 ENDS = 40.0
 INTERRUPTED = 130
 # Period of the check that nodes are alive [s].
-LOOK = 1.0
+START_CHECK_TIME = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Session:
         The checkout, or a copy.
     environment : mapping
         Environment of the commands.
-    say : callable
+    log : callable
         Called with each command before it runs.
     change : callable, optional
         Changes a command before it runs, for shorter tests.
@@ -150,12 +150,12 @@ class Session:
         self,
         folder: Path,
         environment: Mapping[str, str],
-        say: Callable[[str], None],
+        log: Callable[[str], None],
         change: Callable[[str], str] = str,
     ) -> None:
         self._folder = folder
         self._environment = dict(environment)
-        self._say = say
+        self._log = log
         self._change = change
         self._nodes: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
         self._logs = Path()
@@ -220,7 +220,7 @@ class Session:
 
     def _open(self, command: str, stdin: int, output: IO[Any]) -> subprocess.Popen[bytes]:
         """Start a command in a shell with the environment of this checkout."""
-        self._say(command)
+        self._log(command)
         before = "" if "scripts/setup" in command else "source scripts/env.sh\n"
         return subprocess.Popen(
             ["bash", "-c", f"{before}{command}"],
@@ -255,7 +255,7 @@ class Session:
         end = time.monotonic() + LIMIT
         while True:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                return process.wait(LOOK)
+                return process.wait(START_CHECK_TIME)
             for name, (node, log) in self._nodes.items():
                 if node.poll() is not None:
                     raise PageError(f"{command}\n{name} has ended: {log.read_text('utf-8')}")
@@ -295,7 +295,7 @@ class Session:
         """
         for name, (process, log) in list(self._nodes.items()):
             if process.poll() is not None:
-                raise PageError(f"{name} has ended by itself: {log.read_text('utf-8')}")
+                raise PageError(f"{name} has ended unexpectedly: {log.read_text('utf-8')}")
             process.send_signal(signal.SIGINT)
         for name, (process, log) in list(self._nodes.items()):
             try:

@@ -2,7 +2,7 @@
 
 The process that collected forks one shard per core. The shards take test files from one pipe, the
 longest ones first, and send their reports back. Smoke tests and the campaign start real nodes: they
-run at the end, one after the other, with nothing beside them.
+run at the end, one after the other, with no other load.
 """
 
 from __future__ import annotations

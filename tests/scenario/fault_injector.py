@@ -148,11 +148,11 @@ class FaultInjector:
             case _:
                 bus.hang(axis)
 
-                def go_on() -> None:
+                def resume() -> None:
                     drive.hung = False
                     drive.tick(self._timeline.now)
 
-                return go_on
+                return resume
         return _nothing
 
     def _inject_camera_fault(self, fault: Fault) -> Undo:
@@ -220,13 +220,13 @@ class FaultInjector:
         """Act now, and after each pause during a fault."""
         end, chance = self._timeline.now + fault.lasts, self._chance_of(fault)
 
-        def go_on() -> None:
+        def act_and_reschedule() -> None:
             if self._timeline.now < end:
                 act()
                 seconds = pause() if pause else chance.uniform(*_TREMOR_PERIOD)
-                self._timeline.call_after(seconds, go_on)
+                self._timeline.call_after(seconds, act_and_reschedule)
 
-        go_on()
+        act_and_reschedule()
 
     def _change_parameters(self, fault: Fault) -> Undo:
         rig, values = self._rig, dataclasses.asdict(self._rig.steering)

@@ -145,7 +145,7 @@ class Fault:
 
 
 def rogue_topic(fault: Fault) -> str:
-    """Return the topic on which a fault lets a foreign node publish; empty if none."""
+    """Return the topic on which a foreign node publishes during a fault; empty if none."""
     if fault.part == FLOOD:
         return ROGUE_TOPICS[int(fault.size * len(ROGUE_TOPICS))]
     name = fault.part.removeprefix(ROGUE)

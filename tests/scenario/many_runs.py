@@ -96,7 +96,7 @@ def results_here(seeds: range) -> Iterator[RunResult]:
 
 
 def results_of_cluster(address: str, seeds: range) -> Iterator[RunResult]:
-    """Yield the results of seeds, run by the workers of a scheduler; `on_cluster` says more."""
+    """Yield the results of seeds, run by the workers of a scheduler; see `on_cluster`."""
     parts = [seeds[first : first + _PART] for first in range(0, len(seeds), _PART)]
     yield from itertools.chain.from_iterable(on_cluster(address, run_part, parts))
 

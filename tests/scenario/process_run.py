@@ -40,7 +40,7 @@ _MOST = 3
 _LATEST, _SHORTEST, _LONGEST = 3.0, 0.05, 3.0
 _DEEP_ENOUGH = 0.002
 _START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
-# Gap after which the emulated drives stood still: they publish with each SYNC of the driver [s].
+# Gap that shows that drive time was paused: they publish with each SYNC of the driver [s].
 _WITHOUT_SYNC = 0.1
 
 
@@ -119,7 +119,7 @@ class ProcessMonitor(RosRigClient):
         at = self.positions[-1]
         moved_at = at.time - self._begun
         if at.time - before > _WITHOUT_SYNC:
-            self.watch.observe_drives_go_on(moved_at)
+            self.watch.observe_drives_resumed(moved_at)
         if self._received_hold:
             self.watch.observe_motors(moved_at, at.insertion, at.rotation)
 
@@ -192,14 +192,14 @@ def _insert(monitor: ProcessMonitor, graph: TrialProcesses, faults: Sequence[Fau
     try:
         monitor.draw_out()
     except UserError as error:
-        monitor.watch.violate("the_way_goes_on", monitor.now, str(error))
+        monitor.watch.violate("run_can_continue", monitor.now, str(error))
 
 
 def _begin(monitor: ProcessMonitor, graph: TrialProcesses, fault: Fault) -> None:
     if graph.nodes[fault.part].exit_code is not None:
         return
     if fault.part == "device_driver":
-        monitor.watch.observe_driver(monitor.now, speaks=False)
+        monitor.watch.observe_driver(monitor.now, responsive=False)
     if fault.kind is Kind.OFF:
         graph.kill(fault.part)
     else:
@@ -212,4 +212,4 @@ def _end(monitor: ProcessMonitor, graph: TrialProcesses, fault: Fault) -> None:
     else:
         graph.signal(fault.part, signal.SIGCONT)
     if fault.part == "device_driver":
-        monitor.watch.observe_driver(monitor.now, speaks=True)
+        monitor.watch.observe_driver(monitor.now, responsive=True)

@@ -172,7 +172,7 @@ class SoakRig:
 
     @property
     def now(self) -> float:
-        """Virtual time since the begin [s]."""
+        """Virtual time since the start [s]."""
         return self.runner.now
 
     @property
@@ -204,7 +204,7 @@ class SoakRig:
                 self.recorders[-1].cut(self.now)
 
     def processes_of(self, name: str) -> tuple[str, ...]:
-        """Return the components that are one process with a node: the console has two."""
+        """Return the components that share a process with a node; the console has two."""
         return _CONSOLE if name == CONSOLE else (name,)
 
     def record(self) -> None:
@@ -249,14 +249,14 @@ class SoakRig:
         self._adapter_is_open = False
         driver = DeviceDriver(DeviceDriverParameters(link="virtual", channel="soak"))
         driver.inputs = tuple(
-            dataclasses.replace(row, handler=partial(self._take_hold, row.handler))
+            dataclasses.replace(row, handler=partial(self._receive_hold, row.handler))
             if row.topic == HOLD
             else row
             for row in driver.inputs
         )
         return driver
 
-    def _take_hold(self, handler: Any, message: HoldState, at: Any) -> Any:
+    def _receive_hold(self, handler: Any, message: HoldState, at: Any) -> Any:
         self.on_hold_received(message, at.steady)
         return handler(message, at)
 

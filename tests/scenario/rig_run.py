@@ -24,7 +24,7 @@ _FAULTS_OVER = 30.0
 # for 8 s, and a restarted driver sets its drives up again.
 _GO_ON, _DRAW_OUT = 60.0, 60.0
 # Period of the check whether a run is over [s].
-_LOOK = 0.1
+_POLL_PERIOD = 0.1
 # Depth of a run without faults [m], and largest distance of its tip from the plane [m].
 UNDISTURBED_DEPTH, _CONVERGED = 0.08, 0.001
 _HOLD, _JOINTS = "/device/hold", "/joint_states"
@@ -34,7 +34,7 @@ _HOLD_LINKS = ("/joy", _HOLD)
 _AT_PAGE = (of.CONSOLE, of.PAGE, of.PAGE_LINE)
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
 # Parts whose faults keep joint states from the controller.
-_TAKE_JOINTS = (_JOINTS, "device_driver", "plane_controller")
+_JOINT_STATE_SOURCES = (_JOINTS, "device_driver", "plane_controller")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +93,7 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     at_page = any(fault.part in _AT_PAGE for fault in faults)
     rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH, at_page=at_page)
     if any(fault.part == of.SECOND_PERSON for fault in faults):
-        # Their joystick must be received neutral before it counts.
+        # Their joystick must report neutral once before it counts.
         for name in SECOND:
             rig.start(name)
     of_recording = [fault for fault in faults if fault.part in (of.RECORDER, of.DISK)]
@@ -106,15 +106,15 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     while rig.now < _FAULTS_OVER and (
         schedule.has_active or (schedule.has_pending and not _has_left(rig))
     ):
-        rig.run(_LOOK)
+        rig.run(_POLL_PERIOD)
     schedule.cancel_pending()
     calm = rig.now
     while rig.now < calm + _GO_ON + _DRAW_OUT and not _has_left(rig):
         if rig.now > calm + _GO_ON and rig.person.goal is OperatorGoal.INSERT:
             rig.person.goal = OperatorGoal.WITHDRAW
-        rig.run(_LOOK)
+        rig.run(_POLL_PERIOD)
     if not _has_left(rig):
-        watch.violate("the_way_goes_on", rig.now, _state_of(rig))
+        watch.violate("run_can_continue", rig.now, _state_of(rig))
     losses = rig.losses(check_killed=len(of_recording) == 1)
     if losses:
         watch.violate("nothing_recorded_is_lost", rig.now, "; ".join(losses))
@@ -143,12 +143,12 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
     slowness = max(slow, default=0.0) * SLOWEST_HANDLER
     watch = InvariantMonitor(SafetyLimits(), RELEASE_BOUND + late, slowness)
     rogue = {rogue_topic(fault) for fault in faults}
-    joints_faulty = _JOINTS in rogue or any(fault.part in _TAKE_JOINTS for fault in faults)
+    joints_faulty = _JOINTS in rogue or any(fault.part in _JOINT_STATE_SOURCES for fault in faults)
 
     def observe_motors(now: float, at: Motors) -> None:
         rig.digest.update(_rounded((at.insertion, at.rotation)))
         watch.observe_hand(now, holds=rig.hand_presses)
-        watch.observe_driver(now, speaks=rig.runner.is_responsive("device_driver"))
+        watch.observe_driver(now, responsive=rig.runner.is_responsive("device_driver"))
         watch.observe_motors(now, at.insertion, at.rotation)
         if rig.recorders:
             watch.observe_waiting(now, rig.recorders[-1].recording.bytes_waiting)
@@ -193,7 +193,7 @@ def _watch_set_points(rig: SoakRig, watch: InvariantMonitor) -> None:
 
     def watch_frames(batch: Sequence[Any]) -> None:
         for frame in batch:
-            if (set_point := frames.take(frame.identifier, frame.data)) is not None:
+            if (set_point := frames.decode_set_point(frame.identifier, frame.data)) is not None:
                 node, position = set_point
                 watch.observe_set_point(rig.now, axes[node], position)
 

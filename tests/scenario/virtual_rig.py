@@ -1,4 +1,4 @@
-"""Driver and emulated drives on a virtual clock, with other nodes beside them."""
+"""Driver, emulated drives and other nodes on a virtual clock."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class SecondNode(Component):
 
 
 class VirtualRig(ConformanceRig):
-    """Drives, driver and client, beside which other nodes start."""
+    """Drives, driver and client; other nodes can be added."""
 
     def send(self, insertion: float, stamp_ns: int) -> None:
         """Send a step to a position [m] for the tip of a stamp [ns]."""

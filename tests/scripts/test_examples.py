@@ -102,7 +102,7 @@ def test_sidestep_leads_around_an_obstacle(own: Any) -> None:
     ("name", "warns"),
     [("thin_needle", False), ("unknown_tissue", True), ("bare_steel", False), ("glare", False)],
 )
-def test_simulate_takes_the_parameter_files(name: str, warns: bool) -> None:
+def test_simulate_accepts_the_parameter_files(name: str, warns: bool) -> None:
     path = EXAMPLES / "params" / f"{name}.yaml"
     given, options = read_parameters(path, NODES), parse([])
     refuse_reserved(path, given, options)

@@ -1,4 +1,4 @@
-"""A signal that ends a script also ends its child processes, whatever they are doing."""
+"""A signal that ends a script also ends its child processes in any state."""
 
 import os
 import signal
@@ -35,8 +35,8 @@ def test_a_signal_ends_script_and_child(number: signal.Signals) -> None:
 
 
 def test_the_exit_code_of_a_command_is_passed_on() -> None:
-    words = ["bash", "-c", f". '{JOBS}'; run false; echo $code; run true; echo $code"]
-    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "1\n0\n"
+    argv = ["bash", "-c", f". '{JOBS}'; run false; echo $code; run true; echo $code"]
+    assert subprocess.run(argv, capture_output=True, text=True, check=True).stdout == "1\n0\n"
 
 
 @pytest.mark.parametrize("script", ["simulate", "console", "verify", "paper", "bench", "test"])

@@ -1,4 +1,4 @@
-"""The small `ros2` of environments without ROS 2's command line."""
+"""The small `ros2` command for environments without the ROS 2 command line."""
 
 from __future__ import annotations
 

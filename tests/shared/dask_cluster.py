@@ -36,8 +36,8 @@ class Cluster:
             "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder),
         )  # fmt: skip
 
-    def _start(self, errors: int, *words: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "dask", *words]
+    def _start(self, errors: int, *argv: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "dask", *argv]
         return subprocess.Popen(command, env=self._environment, stderr=errors, text=True)
 
     def end(self) -> None:

@@ -41,12 +41,12 @@ class Scene:
         fields = {"count": count, "pressed": pressed, "speed": 0.5, "mode": "insert"}
         return json.dumps({**fields, **changes})
 
-    def say(self, page: int, pressed: bool, **changes: Any) -> HoldRefusal | None:
+    def send(self, page: int, pressed: bool, **changes: Any) -> HoldRefusal | None:
         return self.protocol.receive(page, self.message(page, pressed, **changes), self.now)
 
     def press(self, page: int) -> None:
-        assert self.say(page, False) is None
-        assert self.say(page, True) is None
+        assert self.send(page, False) is None
+        assert self.send(page, True) is None
         assert self.pressed
 
     def wait(self, seconds: float) -> None:

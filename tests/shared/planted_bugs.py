@@ -50,7 +50,7 @@ class PlantedBug(NamedTuple):
     faults_of: int | None = None
 
 
-def _a_press_beside_waits(receive: Any, hold: Hold, message: HoldState, *a: Any, **k: Any) -> Any:
+def _queue_second_press(receive: Any, hold: Hold, message: HoldState, *a: Any, **k: Any) -> Any:
     beside = hold.owner not in (None, message.source)
     rule = receive(hold, message, *a, **k)
     if beside and message.source in hold._sources:
@@ -58,11 +58,11 @@ def _a_press_beside_waits(receive: Any, hold: Hold, message: HoldState, *a: Any,
     return rule
 
 
-def _until_of_anybody(hold: Hold) -> float:
+def _until_of_any_source(hold: Hold) -> float:
     return max((one.until for one in hold._sources.values()), default=-math.inf)
 
 
-def _forgiving(lapses: Any, session: PageSession, now: float) -> bool:
+def _rearm_when_stale(lapses: Any, session: PageSession, now: float) -> bool:
     lapsed = bool(lapses(session, now))
     session._armed = session._armed or lapsed
     return lapsed
@@ -79,17 +79,19 @@ def _axis_scaled(name: str, scale: float) -> Plant:
     return wrapped(EmulatedDrives, "axes", axes)
 
 
-def _twice(drive: Any, *given: Any) -> None:
+def _drive_twice(drive: Any, *given: Any) -> None:
     drive(*given)
     drive(*given)
 
 
-def _kept_quiet(is_new: Any, device: DeviceInterface, status: Any, now: float) -> bool:
+def _hide_motion(is_new: Any, device: DeviceInterface, status: Any, now: float) -> bool:
     return status.state != State.MOVING.value and bool(is_new(device, status, now))
 
 
-def _too_deep(say: Any, steering: Any, *more: Any) -> Any:
-    return dataclasses.replace(say(steering, *more), insertion_m=1.1 * steering.insertion)
+def _report_too_deep(controller_status: Any, steering: Any, *more: Any) -> Any:
+    return dataclasses.replace(
+        controller_status(steering, *more), insertion_m=1.1 * steering.insertion
+    )
 
 
 def _refuse(*_: Any) -> Any:
@@ -97,7 +99,7 @@ def _refuse(*_: Any) -> Any:
     return ServiceResult(False, "no")
 
 
-def _away(law: Any, *given: Any) -> Any:
+def _turn_away(law: Any, *given: Any) -> Any:
     command = law(*given)
     return dataclasses.replace(command, rotation_rate=-command.rotation_rate)
 
@@ -113,45 +115,53 @@ _PLANTED: dict[str, tuple[Any, ...]] = {
         56,
     ),
     "a press from before": ("no_motion_by_itself", BUGS["hold_new_press"], 143),
-    "a press beside the owner waits": (
+    "a press during another hold is queued": (
         "no_motion_by_another",
-        wrapped(Hold, "receive", _a_press_beside_waits),
+        wrapped(Hold, "receive", _queue_second_press),
         235,
     ),
-    "a hold that anybody keeps": (
+    "a hold that any source extends": (
         "no_motion_by_another",
-        set_to(Hold, until=property(_until_of_anybody)),
+        set_to(Hold, until=property(_until_of_any_source)),
         16,
         466,
     ),
-    "a page's hold that outlives its words": (
-        "hold_is_of_now",
+    "a page's hold that outlives its messages": (
+        "hold_is_current",
         set_to(page_session, ECHO_AGE_LIMIT=2.0),
         73,
     ),
-    "a page's lost press that goes on": (
-        "hold_is_of_now",
-        wrapped(PageSession, "end_if_stale", _forgiving),
+    "a page's lost press that resumes": (
+        "hold_is_current",
+        wrapped(PageSession, "end_if_stale", _rearm_when_stale),
         15,
     ),
     "a screw of twice the lead": ("none_beyond_limits", _axis_scaled("insertion", 2.0), 1),
-    "a cycle that orders twice": ("none_beyond_limits", wrapped(DeviceCore, "drive", _twice), 1),
-    "a motion kept quiet": ("status_is_true", wrapped(DeviceInterface, "_is_new", _kept_quiet), 1),
-    "a fault without a word": (
+    "a cycle that orders twice": (
+        "none_beyond_limits",
+        wrapped(DeviceCore, "drive", _drive_twice),
+        1,
+    ),
+    "an unreported motion": (
+        "status_is_true",
+        wrapped(DeviceInterface, "_is_new", _hide_motion),
+        1,
+    ),
+    "a fault without a reason": (
         "faults_are_named",
         wrapped(DeviceCore, "fail", lambda fail, core, _, rule=None: fail(core, "", rule)),
         7,
     ),
-    "an insertion told too deep": (
-        "belief_equals_joints",
-        wrapped(plane_controller, "controller_status", _too_deep),
+    "an insertion reported too deep": (
+        "depth_matches_joints",
+        wrapped(plane_controller, "controller_status", _report_too_deep),
         2,
     ),
     "rotation the wrong way": ("turns_as_commanded", _axis_scaled("rotation", -1.0), 1),
-    "an emergency stop unheard": ("estop_stops", BUGS["estop_latches"], 40),
-    "a reset refused": ("the_way_goes_on", set_to(MotionSupervisor, reset=_refuse), 7),
+    "an ignored emergency stop": ("estop_stops", BUGS["estop_latches"], 40),
+    "a reset refused": ("run_can_continue", set_to(MotionSupervisor, reset=_refuse), 7),
     "a queue without a bound": ("queues_are_bounded", set_to(Recording, append=_append_all), 608),
-    "a message dropped unsaid": (
+    "a silently dropped message": (
         "nothing_recorded_is_lost",
         set_to(Recording, _drop=lambda *_: None),
         68,
@@ -161,7 +171,11 @@ _PLANTED: dict[str, tuple[Any, ...]] = {
         set_to(BagWriter, flush=lambda _: None),
         10,
     ),
-    "a law that turns away": ("undisturbed_converges", wrapped(RollLaw, "__call__", _away), 100),
+    "a law that turns away": (
+        "undisturbed_converges",
+        wrapped(RollLaw, "__call__", _turn_away),
+        100,
+    ),
 }
 PLANTED = {name: PlantedBug(*row) for name, row in _PLANTED.items()}
 
@@ -204,26 +218,26 @@ def _monitor_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
 
 _MENDED: dict[str, tuple[str, Plant]] = {
     "a_set_up_on_a_bus_that_repeats": (
-        "the_way_goes_on",
+        "run_can_continue",
         set_to(cia402_axis, StuckFaultError=NEVER_RAISED),
     ),
-    "an_adapter_lost_as_drives_say_who_they_are": (
+    "an_adapter_lost_during_identification": (
         "no_node_crashes",
         set_to(device_driver, LinkError=NEVER_RAISED),
     ),
     "an_emergency_stop_while_drives_are_waited_for": (
-        "the_way_goes_on",
+        "run_can_continue",
         wrapped(DeviceDriver, "_set_up_drives", _unless_stopped),
     ),
-    "blocked_when_the_hold_is_let_go": (
+    "blocked_at_the_release_of_the_hold": (
         "no_motion_without_hold",
         wrapped(DriveMachine, "update", _unaware),
     ),
-    "a_drive_starts_anew_within_its_set_up": (
-        "the_way_goes_on",
+    "a_drive_restarts_during_its_set_up": (
+        "run_can_continue",
         wrapped(cia402_axis, "await_start", _forgetful),
     ),
-    "a_reliable_topic_out_of_order": ("the_way_goes_on", set_to(link_faults, _RESENT={})),
+    "a_reliable_topic_out_of_order": ("run_can_continue", set_to(link_faults, _RESENT={})),
     "a_blocked_drive_catches_up": ("none_beyond_limits", _monitor_of_drives_never_behind),
     "set_points_come_twice": ("none_beyond_limits", _monitor_of_drives_never_behind),
     "set_points_come_late": ("none_beyond_limits", _monitor_of_drives_never_behind),
@@ -232,7 +246,7 @@ _MENDED: dict[str, tuple[str, Plant]] = {
         "no_motion_without_hold",
         _monitor_forgets(_homing_until=-1.0),
     ),
-    "a_rebooted_drive_is_homed_where_it_stands": (
+    "a_rebooted_drive_is_homed_at_its_position": (
         "turns_as_commanded",
         _monitor_forgets(_zero=0.0),
     ),

@@ -1,4 +1,4 @@
-"""Random messages of any type, valid and extreme, as of a faulty publisher."""
+"""Random messages of any type, valid and extreme, as from a faulty publisher."""
 
 from __future__ import annotations
 

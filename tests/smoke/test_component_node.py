@@ -49,7 +49,7 @@ from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.main import run_component
 from needle_core.settings.parameter_fields import check_fields, parameter
 
-PATIENCE = 60.0  # [s]
+TIMEOUT = 60.0  # [s]
 LONGEST = 1000
 
 
@@ -197,12 +197,12 @@ class Bench:
         )
 
     def until(self, condition: Callable[[], bool]) -> None:
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while not condition():
             assert time.monotonic() < end, (self.received, self.health, self.echo.answers)
             self._executor.spin_once(timeout_sec=0.02)
 
-    def say(self, text: str) -> None:
+    def publish(self, text: str) -> None:
         """Publish a word, and wait for its echo."""
         before = len(self.received)
         self.words.publish(String(data=text))
@@ -244,9 +244,9 @@ def test_bad_or_long_data_and_a_failing_handler_are_reported_and_end_nothing(ben
     bench.words.publish(String(data="x" * 2 * LONGEST))
     bench.until(lambda: "too long" in health("input") and "'refused word': '2'" in health("input"))
     # Actions before the failure of a handler are executed.
-    bench.say("fail")
+    bench.publish("fail")
     bench.until(lambda: "internal error: ValueError: no such word" in health("handlers"))
-    bench.say("on")
+    bench.publish("on")
     assert bench.received == ["fail", "on"]
 
 
@@ -256,7 +256,7 @@ def test_services_ports_and_calls_are_answered(bench: Bench) -> None:
     for on in (True, False):
         now = bench.call(SetBool, "echo/twice", data=on)
         assert (now.success, now.message) == (on, "once")
-    bench.say("call")
+    bench.publish("call")
     bench.until(lambda: bool(bench.echo.answers))
     assert bench.echo.answers == [Answer("nobody/there", False, "no server", answered=False)]
     bench.wire.arrive((1, 2))
@@ -270,12 +270,12 @@ def test_services_ports_and_calls_are_answered(bench: Bench) -> None:
 
 
 def test_latched_messages_lazy_inputs_and_peers_and_a_qos_that_does_not_fit(bench: Bench) -> None:
-    bench.say("keep")
+    bench.publish("keep")
     bench.subscribe("echo/kept", base_node.LATCHED)
     bench.until(lambda: "kept" in bench.received)
     whisper = bench.other.create_publisher(String, "whisper", base_node.RELIABLE)
     for word, listeners in (("listen", 1), ("leave", 0)):
-        bench.say(word)
+        bench.publish(word)
         bench.until(lambda n=listeners: whisper.get_subscription_count() == n)  # type: ignore[misc]
     bench.until(lambda: bench.node.peers.subscribers.get("said") == ("other",))
     assert bench.node.peers.publishers["word"] == ("other",)

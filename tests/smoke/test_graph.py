@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rosbags.rosbag2 import Reader
 
-# Convergence needs more than these 10 mm: the tip starts 3 mm beside the plane.
+# Convergence needs more than these 10 mm: the tip starts 3 mm off the plane.
 COMMAND = ("-m", "needle_bringup.simulation.simulate", "--graph", "--level", "drive")
 TOPICS = {
     "/joint_states",

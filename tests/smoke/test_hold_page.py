@@ -20,7 +20,7 @@ pytestmark = [
     pytest.mark.skipif(chromium() is None, reason="no chromium: apt-get install chromium"),
 ]
 
-PATIENCE = 30.0
+TIMEOUT = 30.0
 ELSEWHERE = (400.0, 300.0)
 _STATE = "document.documentElement.dataset.holdState"
 
@@ -40,28 +40,28 @@ class Scene:
         self._counts = counts
 
     def until(self, condition: Callable[[], object], what: str) -> None:
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT
         while not condition():
-            assert time.monotonic() < deadline, f"waited in vain: {what}"
+            assert time.monotonic() < deadline, f"timed out: {what}"
             time.sleep(0.005)
 
     def until_released(self) -> None:
         self.until(lambda: not self.states[-1].pressed, "released")
 
-    def let_pass(self, count: int) -> None:
+    def wait_for_states(self, count: int) -> None:
         """Wait for a number of states."""
         enough = len(self.states) + count
         self.until(lambda: len(self.states) >= enough, "states")
 
-    def hold(self, press: Callable[[], None], let_go: Callable[[], None]) -> None:
+    def hold(self, press: Callable[[], None], release: Callable[[], None]) -> None:
         """Press until the hold lasts: on a busy machine it may be lost at once."""
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT
         while True:
             assert time.monotonic() < deadline, "no press counts"
-            let_go()
+            release()
             self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
             press()
-            self.let_pass(15)
+            self.wait_for_states(15)
             if self.states[-1].pressed:
                 return
 
@@ -72,7 +72,7 @@ class Scene:
 
         The reason on the page must be `why`, if given.
         """
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT
         while True:
             assert time.monotonic() < deadline, "holds end by themselves alone"
             hold()
@@ -88,14 +88,14 @@ class Scene:
         """Reason that the page gives for the end of the last hold."""
         return str(self.tab.run("needleHold.status.why"))
 
-    def never_pressed(self, press: Callable[[], None]) -> bool:
-        """Press, and return whether the hold counts."""
+    def press_is_ignored(self, press: Callable[[], None]) -> bool:
+        """Press, and return whether the press is ignored."""
         self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
         before = len(self.states)
         press()
         # The browser has processed the event when it answers.
         self.tab.run("0")
-        self.let_pass(15)
+        self.wait_for_states(15)
         return not any(state.pressed for state in self.states[before:])
 
     def hold_pointer(self) -> None:
@@ -162,7 +162,7 @@ def test_a_removed_button_or_page_ends_its_hold(scene: Scene) -> None:
     scene.tab.release_space()
 
 
-def test_a_stalled_page_says_so_until_the_next_press(scene: Scene) -> None:
+def test_a_stalled_page_reports_it_until_the_next_press(scene: Scene) -> None:
     tab = scene.tab
     scene.hold_pointer()
     tab.run("const end = performance.now() + 500; while (performance.now() < end);")
@@ -178,17 +178,17 @@ def test_a_stalled_page_says_so_until_the_next_press(scene: Scene) -> None:
 def test_other_events_than_a_press_do_not_hold(scene: Scene) -> None:
     tab = scene.tab
     tab.release_space()
-    assert scene.never_pressed(lambda: tab.press_space(repeat=True))
+    assert scene.press_is_ignored(lambda: tab.press_space(repeat=True))
     tab.release_space()
     tab.run("document.querySelector('input').focus()")
-    assert scene.never_pressed(tab.press_space)
+    assert scene.press_is_ignored(tab.press_space)
     tab.release_space()
     tab.run("document.activeElement.blur()")
     tab.run("document.querySelector('[data-hold]').ariaDisabled = 'true'")
-    assert scene.never_pressed(lambda: tab.press_pointer(*BUTTON))
+    assert scene.press_is_ignored(lambda: tab.press_pointer(*BUTTON))
     tab.release_pointer(*BUTTON)
-    assert scene.never_pressed(tab.press_space)
+    assert scene.press_is_ignored(tab.press_space)
     tab.release_space()
     tab.run("document.querySelector('[data-hold]').ariaDisabled = 'false'")
-    assert scene.never_pressed(lambda: tab.press_pointer(*ELSEWHERE))
+    assert scene.press_is_ignored(lambda: tab.press_pointer(*ELSEWHERE))
     tab.release_pointer(*ELSEWHERE)

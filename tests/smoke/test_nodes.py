@@ -23,7 +23,7 @@ from needle_core.files.installed import find_executable
 from needle_tracker.optics.calibration import SIDES
 from reference.rig_nodes import REGISTRATION, executables
 
-PATIENCE = 60.0  # [s]
+TIMEOUT = 60.0  # [s]
 # Packages that the environment may lack.
 EXTRAS = {"console": "nicegui", "openigtlink": "pyigtl"}
 
@@ -57,7 +57,7 @@ def words(name: str, folder: Path) -> list[str]:
 
 def awaited(condition: Callable[[], bool]) -> bool:
     """Return whether a condition holds before the time-out."""
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + TIMEOUT
     while not condition() and time.monotonic() < until:
         time.sleep(0.1)
     return condition()
@@ -81,7 +81,7 @@ def run_until_sigterm(names: Collection[str], folder: Path, listener: Node) -> N
         assert started - set(listener.get_node_names()) == set()
         for node in nodes:
             node.signal_group(signal.SIGTERM)
-        assert [node.name for node in wait_for(nodes, PATIENCE)] == []
+        assert [node.name for node in wait_for(nodes, TIMEOUT)] == []
     finally:
         stop(nodes)
     for node in nodes:
@@ -96,6 +96,6 @@ def test_every_node_starts_is_discovered_and_ends_on_sigterm(
         (tmp_path / side).mkdir()
         cv2.imwrite(str(tmp_path / side / "1.png"), np.zeros((768, 1024), np.uint8))
     names = {name for _, name, _ in executables("node")}
-    # The player ends as soon as a rig starts beside it.
+    # The player ends as soon as it discovers a rig.
     run_until_sigterm({"player"}, tmp_path, listener)
     run_until_sigterm(names - {"player"}, tmp_path, listener)

@@ -1,4 +1,4 @@
-"""The documentation site: no warnings (such as dead links), nothing loaded from the network."""
+"""The documentation site builds without warnings and loads nothing from the network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""package.xml and the import contracts name what the packages import."""
+"""package.xml and the import contracts list the imports of each package."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def test_every_part_and_message_of_diagnostics_is_listed(nodes: list[RigNode]) -
     assert words - compared <= len(found) <= words
 
 
-def test_the_rows_of_nodes_that_are_no_components_are_in_their_code() -> None:
+def test_the_rows_of_nodes_that_are_not_components_match_their_code() -> None:
     for node in NOT_COMPONENTS:
         source = inspect.getsource(node.module)
         offered = {

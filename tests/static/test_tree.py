@@ -36,7 +36,7 @@ class Empty:
 '''
 
 
-def test_a_line_of_code_is_no_blank_comment_or_docstring() -> None:
+def test_blank_lines_comments_and_docstrings_are_not_code() -> None:
     assert code_lines(SOURCE) == 2 + 1 + 3 + 1
 
 

@@ -13,7 +13,7 @@ _PACKAGE_DATA = {"": ["py.typed", "*.onnx", "*.xml", "static/*"]}
 
 
 def set_up(script: str) -> None:
-    """Install one package as its package.xml and its `executables.py` say.
+    """Install one package as described by its package.xml and `executables.py`.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def set_up(script: str) -> None:
 
 
 def set_up_all(root: Path) -> None:
-    """Install all packages of a checkout as one distribution, beside what its pyproject.toml says.
+    """Install all packages of a checkout as one distribution, in addition to pyproject.toml.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def set_up_all(root: Path) -> None:
 
 
 def data_files(folder: Path, where: Path) -> list[tuple[str, list[str]]]:
-    """Return the files of a package beside its code, and where ament and ROS look for them.
+    """Return the data files of a package, and where ament and ROS look for them.
 
     Parameters
     ----------

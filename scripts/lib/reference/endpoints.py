@@ -43,7 +43,7 @@ def endpoints_of(component: Component) -> Iterator[Endpoint]:
         *((SUBSCRIBES, row) for row in component.inputs),
     ]
     for role, row in rows:
-        yield Endpoint(role, row.topic, _type_name(row.message), in_words(row.delivery))
+        yield Endpoint(role, row.topic, _type_name(row.message), describe_delivery(row.delivery))
     for offered in component.services:
         yield service(SERVES, offered.name, has_argument=offered.has_argument)
 
@@ -53,7 +53,7 @@ def service(role: str, name: str, *, has_argument: bool = False) -> Endpoint:
     return Endpoint(role, name, f"std_srvs/{'SetBool' if has_argument else 'Trigger'}", "")
 
 
-def in_words(delivery: Delivery) -> str:
+def describe_delivery(delivery: Delivery) -> str:
     """Return a quality of service as text: `reliable, 10`, `reliable, latched, 1`."""
     words = ["reliable" if delivery.reliable else "best effort"]
     if delivery.latched:

@@ -31,7 +31,7 @@ _LARGEST_STEP = 2.0  # maximum norm of the gradients
 _WORST, _MOST_BAD = (1.0, 30.0), 20  # losses above which a batch is skipped; consecutive skips
 _FULL_PRECISION = 0.9  # progress after which bfloat16 is not used
 _MEAN_OVER = 1000  # number of steps over which the weights are averaged
-_LOOK_EVERY = 200  # steps between updates of the pool
+_POOL_UPDATE_PERIOD = 200  # steps between updates of the pool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,7 +235,7 @@ def train(run: Run, pool: Pool, plan: Plan) -> None:
     bar = tqdm(total=plan.steps, initial=run.step, desc="training", unit="step", mininterval=10.0)
     pool.update()
     while (progress := max(run.step / plan.steps, run.seconds / (60.0 * plan.minutes))) < 1.0:
-        if run.step % _LOOK_EVERY == 0:
+        if run.step % _POOL_UPDATE_PERIOD == 0:
             pool.update()
         for group in run.optimizer.param_groups:
             group["lr"] = run.rate * rate_share(progress)

@@ -1,4 +1,4 @@
-"""`scripts/bench`: every speed and memory figure beside its reference of the same run."""
+"""`scripts/bench`: every speed and memory figure with its reference from the same run."""
 
 from __future__ import annotations
 

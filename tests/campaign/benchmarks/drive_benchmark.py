@@ -1,4 +1,4 @@
-"""The driver's 50 Hz cycle beside stock python-can, on the same emulated drives.
+"""The driver's 50 Hz cycle compared with stock python-can, on the same emulated drives.
 
 Each client moves both axes over a pseudo-terminal; the process of the drives records when each SYNC
 arrives.
@@ -107,7 +107,7 @@ class PlainSlcan:
     def __init__(self, channel: str) -> None:
         self._bus = can.Bus(interface="slcan", channel=channel, bitrate=BITRATE, sleep_after_open=0)
         self._answers = threading.Semaphore(0)
-        self._notifier = can.Notifier(self._bus, [self._take])
+        self._notifier = can.Notifier(self._bus, [self._receive])
         _map_pdos(self._sdo)
         self._send(0x000, b"\x01\x00")
         for node in NODES:
@@ -128,7 +128,7 @@ class PlainSlcan:
         self._notifier.stop()
         self._bus.shutdown()
 
-    def _take(self, message: can.Message) -> None:
+    def _receive(self, message: can.Message) -> None:
         if message.arbitration_id & ~0x7F == 0x280:
             self._answers.release()
 

@@ -40,10 +40,10 @@ def full_rate(bench: Workbench) -> Iterator[Finding]:
 
 def killed(bench: Workbench) -> Iterator[Finding]:
     """Kill the recorder at random moments, with images and without, and recover the bag."""
-    for what, words in (("images", ()), ("small", ("small",))):
+    for what, argv in (("images", ()), ("small", ("small",))):
         folder = bench.folder / f"killed_{what}"
         folder.mkdir()
-        whys, ages, gaps = zip(*record_and_kill(folder, MOMENTS, *words), strict=True)
+        whys, ages, gaps = zip(*record_and_kill(folder, MOMENTS, *argv), strict=True)
         shutil.rmtree(folder)
         why = [one for one in whys if one]
         yield Finding(

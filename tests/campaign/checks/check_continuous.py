@@ -49,7 +49,7 @@ def hands(_: Workbench) -> Iterator[Finding]:
 
 
 def frame_rates(bench: Workbench) -> Iterator[Finding]:
-    """Study preset best at 5 mm/s beside stepwise insertion, at several frame rates."""
+    """Compare preset best at 5 mm/s with stepwise insertion, at several frame rates."""
     # 5 mm/s times 10, 33 and 100 ms; tips between two used ones have no effect.
     figures = {
         delay: run(Study(f"delay_{delay}", "best", ("--turn-delay-mm", delay)), bench.folder)

@@ -98,7 +98,7 @@ def killed_nodes(_: Workbench) -> Iterator[Finding]:
         yield Finding(
             f"killed_{node}",
             f"kill -9 of {node} at {MOMENTS} moments of an insertion in real time",
-            "no motion beyond the command and the hold, none by itself; the way goes on",
+            "no motion beyond the command and the hold, none without a command; it continues",
             f"{len(texts)} violations {texts[:2]}",
             not texts,
         )

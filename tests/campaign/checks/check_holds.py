@@ -34,8 +34,8 @@ def _finding(kind: str, what: str) -> Finding:
     resumed = [f"{one['resumed_mm']:.2f} mm" for one in outcomes if one["resumed_mm"] > 0.0]
     return Finding(
         kind,
-        f"{what}, at {MOMENTS} random moments at 5 mm/s: last motion; then by "
-        "itself; pressed anew it goes on",
+        f"{what}, at {MOMENTS} random moments at 5 mm/s: last motion; then motion "
+        "without a press; a new press continues",
         f"at most {BOUND:g} ms (and {SAMPLING:g} ms between samples) after the loss; none",
         f"at most {latest:.0f} ms, {distance:.2f} mm (moving at {moving} losses); {len(resumed)} "
         f"{resumed[:3]}; within {again:.1f} s",

@@ -1,4 +1,4 @@
-"""Step C: a stereo tracker that a lab would trust."""
+"""Step C: accuracy and robustness of the stereo tracker."""
 
 from __future__ import annotations
 

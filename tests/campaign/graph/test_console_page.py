@@ -60,9 +60,9 @@ def free_port() -> int:
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """Yield the address of a console on a simulated rig; check its clean exit afterwards."""
-    words = ["--level", "tip", "--port", str(free_port())]
+    argv = ["--level", "tip", "--port", str(free_port())]
     with subprocess.Popen(
-        [sys.executable, "-m", "needle_bringup.simulation.console", *words],
+        [sys.executable, "-m", "needle_bringup.simulation.console", *argv],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -132,7 +132,7 @@ def check_stands_still(page: Page) -> float:
     return at
 
 
-def hold_until(page: Page, press: Hand, let_go: Hand, headline: str) -> None:
+def hold_until(page: Page, press: Hand, release: Hand, headline: str) -> None:
     """Hold until the depth [mm] meets the condition, without a release.
 
     A browser that is delayed by 0.25 s on a busy machine loses the hold; the test then releases and
@@ -143,7 +143,7 @@ def hold_until(page: Page, press: Hand, let_go: Hand, headline: str) -> None:
         try:
             page.wait_for_function(f"() => ({DEPTH})() {headline}", timeout=2e3)
         except TooLate:
-            let_go()
+            release()
         else:
             return
     raise AssertionError(f"the needle does not get there: {page.locator('main').inner_text()}")
@@ -187,7 +187,7 @@ def test_a_pointer_holds_and_stop_ends_it_until_a_new_press(page: Page) -> None:
     assert check_stands_still(page) == at
 
 
-def test_another_page_sees_and_can_stop_but_not_move(
+def test_another_page_can_watch_and_stop_but_not_move(
     page: Page, browser: Any, address: str
 ) -> None:
     page.locator("[data-hold=insert]").hover()

@@ -1,4 +1,4 @@
-"""Nodes that are started by hand steer in any order of their start."""
+"""Nodes started by hand can steer regardless of the order in which they start."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from needle_bringup.simulation.rig_configuration import PACKAGES
 from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.settings.parameter_files import Parameters
 
-PATIENCE = 120.0  # [s]
+TIMEOUT = 120.0  # [s]
 PARAMETERS: Parameters = {
     "sim_rig": {"level": "tip", "seed": 1},
     "plane_controller": {"depth": 0.006},
@@ -36,7 +36,7 @@ def test_nodes_steer_in_any_order(order: tuple[str, ...], tmp_path: Path) -> Non
                 graph.start(PACKAGES[name], name)
                 time.sleep(2.0)
             operator = graph.nodes[OPERATOR]
-            assert wait_for([operator], PATIENCE) == []
+            assert wait_for([operator], TIMEOUT) == []
             assert operator.exit_code == 0, operator.tail(5)
         finally:
             graph.stop()

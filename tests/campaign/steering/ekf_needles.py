@@ -43,7 +43,7 @@ NEEDLE = np.dtype(
 
 
 class EkfNeedles:
-    """The filters and the law of some needles: what `study.Controller` describes.
+    """Filters and law of some needles; implements `study.Controller`.
 
     Parameters
     ----------

@@ -35,8 +35,8 @@ Row = dict[str, Any]
 def steer(study: Study, estimator: str, needles: int) -> Row:
     """Return the figures of some needles of a study, steered by one estimator."""
     preset = "best" if estimator == "ekf" else estimator
-    words = ["--controller", preset, *study.options, "--seed", SEED]
-    options = parse([*words, "--draws", str(needles // _STARTS)])
+    argv = ["--controller", preset, *study.options, "--seed", SEED]
+    options = parse([*argv, "--draws", str(needles // _STARTS)])
     return figures(concatenate([_steered(part, estimator) for part in parts_of(options)]))
 
 
@@ -85,18 +85,18 @@ def figures(outcomes: Outcomes) -> Row:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    words = sys.argv[1:] if arguments is None else arguments
-    return run_command(lambda: _run(words))
+    argv = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: _run(argv))
 
 
-def _run(words: Sequence[str]) -> int:
+def _run(argv: Sequence[str]) -> int:
     parser = CommandParser("estimator_table", "Compare estimators under all disturbances.", "")
     add = parser.add_argument
     add("--needles", default="10000", metavar="N", help="of each row (10000)")
     add("--only", default=",".join(COMPARED), metavar="KEYS", help="rows (default: all)")
     add("--estimators", default=",".join(ESTIMATORS), metavar="NAMES", help="names (default: all)")
     add("--json", metavar="FILE", help="also write all figures as JSON")
-    given = parser.parse_args(words)
+    given = parser.parse_args(argv)
     needles = whole_number("--needles", given.needles, _STARTS, 1_000_000)
     path = output_file("--json", given.json)
     keys, estimators = given.only.split(","), given.estimators.split(",")

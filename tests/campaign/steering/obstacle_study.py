@@ -190,18 +190,18 @@ def figures(outcomes: Sequence[SceneOutcome], times: Sequence[float]) -> dict[st
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study; returns its exit code."""
-    words = sys.argv[1:] if arguments is None else arguments
-    return run_command(lambda: _run(words))
+    argv = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: _run(argv))
 
 
-def _run(words: Sequence[str]) -> int:
+def _run(argv: Sequence[str]) -> int:
     parser = CommandParser("obstacle_study", "Steer needles around generated obstacles.", "")
     add = parser.add_argument
     add("--scenes", default="1000", metavar="N", help="number of scenes (1000)")
     add("--seed", default="1", metavar="N", help="seed of all random numbers (1)")
     add("--noise-mm", default="1", metavar="A", help="maximum error of each coordinate (1)")
     add("--json", metavar="FILE", help="also write the figures as flat JSON")
-    given = parser.parse_args(words)
+    given = parser.parse_args(argv)
     path = output_file("--json", given.json)
     result = study(
         whole_number("--scenes", given.scenes, 1, 100_000),

@@ -43,7 +43,7 @@ def tips_of(path: Path) -> Array:
         ]
     if not rows or not set(_COLUMNS) <= rows[0].keys():
         raise UserError(f"{path}: expected columns {', '.join(_COLUMNS)}")
-    # A repeated row was not measured anew; zeros precede the first measurement.
+    # A repeated row is not a new measurement; zeros precede the first one.
     values = dict.fromkeys(tuple(float(row[name]) for name in _COLUMNS) for row in rows)
     x, y, z = np.array([value[:3] for value in values if any(value[:2])]).T * 1e-3
     inside = y <= 0.0

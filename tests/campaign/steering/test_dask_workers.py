@@ -27,9 +27,9 @@ def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     started.end()
 
 
-def figures_of(folder: Path, *words: str) -> tuple[dict[str, object], str]:
+def figures_of(folder: Path, *argv: str) -> tuple[dict[str, object], str]:
     files = ["--json", str(folder / "f.json"), "--csv", str(folder / "f.csv")]
-    assert main([*STUDY, *words, *files]) == 0
+    assert main([*STUDY, *argv, *files]) == 0
     figures = json.loads((folder / "f.json").read_text("utf-8"))
     for key in ("wall_s", "cpu_s"):
         assert figures.pop(key) > 0.0

@@ -50,8 +50,8 @@ def test_the_reference_filter_steers_and_its_estimate_is_accurate(key: str) -> N
 def test_the_command_prints_and_writes_the_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--needles", "1000", "--only", "push_2", "--estimators", "paper"]
-    assert main([*words, "--json", str(tmp_path / "now.json")]) == 0
+    argv = ["--needles", "1000", "--only", "push_2", "--estimators", "paper"]
+    assert main([*argv, "--json", str(tmp_path / "now.json")]) == 0
     row = json.loads((tmp_path / "now.json").read_text("utf-8"))["push_2"]["paper"]
     assert row["within"] > 0.9
     # An estimator that states no probability has no such figures.

@@ -21,7 +21,7 @@ _FREE = 20
 def calibrated_tip_errors(calibration: Path, seed: int, corner_sigma: float) -> NDArray[np.float64]:
     """Return the errors of noise-free tips with a calibration from noisy corners.
 
-    The set is the one that `docs/calibration.md` asks for. The corners come from the simulation's
+    The set is the one that `docs/calibration.md` requires. The corners come from the simulation's
     own projection.
 
     Parameters

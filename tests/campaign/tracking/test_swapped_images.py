@@ -39,8 +39,8 @@ def drawn(path: Path, scenario: str, seed: int, last_mm: int) -> Iterator[Pair]:
             yield 1e-3 * mm, *renderer.render(pose, plant.centreline(5e-4), mm)
 
 
-class Looks:
-    """A tracker and the watch for swapped images beside it."""
+class SwapBench:
+    """A tracker and the detector of swapped images."""
 
     def __init__(self, calibration: StereoCalibration) -> None:
         settings = StereoTrackerParameters()
@@ -56,18 +56,18 @@ class Looks:
 
 
 @pytest.fixture
-def looks(calibration: StereoCalibration) -> Looks:
-    return Looks(calibration)
+def bench(calibration: StereoCalibration) -> SwapBench:
+    return SwapBench(calibration)
 
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("scenario", ["clean", "clutter", "defocus"])
 def test_swapped_images_are_suspected(
-    looks: Looks, calibration_path: Path, scenario: str, known: bool
+    bench: SwapBench, calibration_path: Path, scenario: str, known: bool
 ) -> None:
     for insertion, left, right in pairs(calibration_path, scenario, 1):
-        looks.update(right, left, insertion if known else None)
-    assert looks.watch.suspected
+        bench.update(right, left, insertion if known else None)
+    assert bench.watch.suspected
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -75,8 +75,8 @@ def test_swapped_images_are_suspected(
     "scenario", ["clean", "clutter", "heavy_clutter", "occlusion", "absent", "defocus"]
 )
 def test_correct_images_are_not_suspected(
-    looks: Looks, calibration_path: Path, scenario: str, known: bool
+    bench: SwapBench, calibration_path: Path, scenario: str, known: bool
 ) -> None:
     for insertion, left, right in pairs(calibration_path, scenario, 2, 60):
-        looks.update(left, right, insertion if known else None)
-    assert not looks.ever
+        bench.update(left, right, insertion if known else None)
+    assert not bench.ever

@@ -64,8 +64,8 @@ def _dim(image: Image, _: np.random.Generator) -> Image:
 
 AS_TRACED = Variation("as traced")
 VARIATIONS = (
-    Variation("width told 0.7 times", width=0.7),
-    Variation("width told 1.3 times", width=1.3),
+    Variation("width set 0.7 times", width=0.7),
+    Variation("width set 1.3 times", width=1.3),
     Variation("stage 1 mm too long", zero=1e-3),
     Variation("stage 1 mm too short", zero=-1e-3),
     Variation("blur of 1 px", degrade=_blurred(1.0)),
@@ -81,7 +81,9 @@ class KnownInput(enum.Enum):
 
     NOTHING = "without"
     INSERTION = "with"
-    EMPTY_PHANTOM = "with the empty phantom and the"  # as on a rig, where a run begins outside
+    EMPTY_PHANTOM = (
+        "with the empty phantom and the"  # as on a rig, where a run starts with the needle outside
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -75,10 +75,10 @@ def insertion_sequence(
     noise : float, optional
         Standard deviation of the sensor's noise, in place of the scenario's [grey levels].
     """
-    trouble = find_scenario(scenario)
+    disturbed_scenario = find_scenario(scenario)
     if noise is not None:
-        trouble = dataclasses.replace(trouble, noise=noise)
-    renderer = StereoRenderer(load_stereo_rig(calibration), seed, scenario=trouble)
+        disturbed_scenario = dataclasses.replace(disturbed_scenario, noise=noise)
+    renderer = StereoRenderer(load_stereo_rig(calibration), seed, scenario=disturbed_scenario)
     rng = np.random.default_rng([seed, 41])
     pitch, roll = rng.uniform(-1.0, 1.0, 2) * (math.radians(5.0), math.pi)
     plant = NeedlePlant(initial_pose(float(pitch), float(roll)), curvature=CURVATURE)

@@ -2,7 +2,7 @@
 
 `python -m campaign.trials.recording_load SECONDS [small]`: the nanoseconds of every header's stamp
 are the message's number on its topic, from 0. Begins when a node named recorder listens to every
-topic; prints, as JSON, what it has sent on which topic. `small` leaves the images out.
+topic; prints, as JSON, the number of messages sent on each topic. `small` leaves the images out.
 """
 
 from __future__ import annotations

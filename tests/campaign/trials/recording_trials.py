@@ -75,7 +75,7 @@ def record_full_rate(folder: Path, duration: float, others: int = 2) -> dict[str
     }
 
 
-def record_and_kill(folder: Path, moments: int, *words: str) -> Iterator[tuple[str, float, int]]:
+def record_and_kill(folder: Path, moments: int, *argv: str) -> Iterator[tuple[str, float, int]]:
     """Kill a recorder at random moments, and recover each bag.
 
     Yields
@@ -91,7 +91,7 @@ def record_and_kill(folder: Path, moments: int, *words: str) -> Iterator[tuple[s
         with (
             reserve_domain_id() as domain,
             recorder(domain, bag) as recording,
-            _process(domain, _LOAD, "3600", *words),
+            _process(domain, _LOAD, "3600", *argv),
         ):
             deadline = time.monotonic() + _START_UP
             # Wait for the first chunk of data on the disk.
@@ -121,14 +121,14 @@ def recorder(
     domain: int, bag: Path, name: str = "recorder"
 ) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
     """Start a recorder with this node name; kill it at the end."""
-    words = ["--ros-args", "-r", f"__node:={name}", "-p", f"bag:={bag}"]
-    return _process(domain, "needle_bags.ros.recorder", *words)
+    argv = ["--ros-args", "-r", f"__node:={name}", "-p", f"bag:={bag}"]
+    return _process(domain, "needle_bags.ros.recorder", *argv)
 
 
 @contextlib.contextmanager
-def _process(domain: int, module: str, *words: str) -> Iterator[subprocess.Popen[str]]:
+def _process(domain: int, module: str, *argv: str) -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(
-        [sys.executable, "-m", module, *words],
+        [sys.executable, "-m", module, *argv],
         env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,

@@ -173,7 +173,7 @@ class RosRigClient(WholeNode):
         return self.positions[-1].insertion if self.positions else 0.0
 
     def last_motion(self, begin: float, end: float) -> float:
-        """Return the time of the last motion in an interval [s]; its begin if there was none."""
+        """Return the time of the last motion in an interval [s]; its start if there was none."""
         return max((at.time for at, _ in self._motions(begin, end)), default=begin)
 
     def travelled_distance(self, begin: float, end: float = math.inf) -> float:

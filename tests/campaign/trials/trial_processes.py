@@ -59,10 +59,10 @@ class TrialProcesses(NodeGraph):
     def begin(self, name: str, *command: str, file: Path | None = None) -> None:
         """Start or restart a node, by its executable or another command."""
         command = command or (find_executable(_PACKAGES[name], name),)
-        words = ("--ros-args", "--disable-external-lib-logs", "--params-file")
+        argv = ("--ros-args", "--disable-external-lib-logs", "--params-file")
         self.nodes[name] = NodeProcess(
             name,
-            [*self._before.get(name, ()), *command, *words, str(file or self._folder / PARAMETERS)],
+            [*self._before.get(name, ()), *command, *argv, str(file or self._folder / PARAMETERS)],
             environment=self._environment,
             log=self._folder / LOGS / f"{name}.log",
         )

@@ -34,11 +34,11 @@ class BagMonitor:
         # Reception times by topic [s].
         self._taken: defaultdict[str, list[float]] = defaultdict(list)
 
-    def take(self, at: float, topic: str) -> None:
+    def record(self, at: float, topic: str) -> None:
         """Record the reception of a message at a time [s]."""
         self._taken[topic].append(at)
 
-    def losses_of_ended(self) -> list[str]:
+    def losses_after_clean_end(self) -> list[str]:
         """Return the losses of a cleanly ended recorder that its bag does not report."""
         kept = _counts(self._bag)
         lost = Counter(json.loads(read_contents(self._bag).custom_data.get(MESSAGES_LOST, "{}")))
@@ -48,7 +48,7 @@ class BagMonitor:
             if kept[topic] + lost[topic] < len(taken)
         ]
 
-    def losses_of_killed(self, killed_at: float) -> list[str]:
+    def losses_after_kill(self, killed_at: float) -> list[str]:
         """Return the losses of a killed recorder among messages that it must have flushed."""
         try:
             recover_bag(self._bag)

@@ -22,9 +22,9 @@ class _Press:
 class HoldMonitor:
     """Follows every hold that reaches the device, and the owner that the device reports.
 
-    A hold has one owner until its release; a press beside it counts only after a release and a new
-    press. So a press during which the device reports another owner, or none, must move nothing for
-    as long as it lasts. The monitor uses no other rule of the device.
+    A hold has one owner until its release; a press of another source counts only after a release
+    and a new press. So a press during which the device reports another owner, or none, must move
+    nothing for as long as it lasts. The monitor uses no other rule of the device.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class HoldMonitor:
         for sender in tuple(self._presses):
             self._end(sender, at)
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Reset, as a restarted device does."""
         self._presses.clear()
 

@@ -131,12 +131,12 @@ class InvariantMonitor:
         idle = at - self._pressed_until
         if pressed and idle > PAGE_LIFETIME:
             text = f"reported as held {idle:.3f} s after the finger was off"
-            self.violate("hold_is_of_now", at, text)
+            self.violate("hold_is_current", at, text)
         begins = pressed and not self._page_holds
         if begins and self._pressed_since < self._page_ended - PAGE_LIFETIME:
             since, ended = self._pressed_since, self._page_ended
             text = f"held again by a press of {since:.3f} s; its hold had ended at {ended:.3f} s"
-            self.violate("hold_is_of_now", at, text)
+            self.violate("hold_is_current", at, text)
         if self._page_holds and not pressed:
             self._page_ended = at
         self._page_holds = pressed
@@ -172,13 +172,13 @@ class InvariantMonitor:
             ahead = [point for point in points if point[0] > insertion] or points[-1:]
             self._commands.append(((insertion, rotation - self._zero), *ahead))
 
-    def observe_driver(self, at: float, *, speaks: bool) -> None:
+    def observe_driver(self, at: float, *, responsive: bool) -> None:
         """Observe whether the driver runs and is connected to its drives."""
-        if not speaks and self._silent_since is None:
+        if not responsive and self._silent_since is None:
             self.hold_monitor.lose_device(at)
-        self._silent_since = None if speaks else self._silent_since or at
-        if not speaks:
-            self.hold_monitor.forget()
+        self._silent_since = None if responsive else self._silent_since or at
+        if not responsive:
+            self.hold_monitor.reset()
             # A restarted driver has not received it, and starts disabled.
             self._estop_since = None
 
@@ -191,8 +191,8 @@ class InvariantMonitor:
         for text in self._limits.observe_set_point(at, axis, place):
             self.violate("none_beyond_limits", at, text)
 
-    def observe_drives_go_on(self, at: float) -> None:
-        """Observe that the time of the drives stood still until now."""
+    def observe_drives_resumed(self, at: float) -> None:
+        """Observe that drive time was paused until now."""
         self._ends_until = at + WATCHDOG_BOUND
 
     def observe_motors(self, at: float, insertion: float, rotation: float) -> None:
@@ -228,7 +228,7 @@ class InvariantMonitor:
             self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
 
     def observe_belief(self, at: float, status: ControllerStatus, *, joints_known: bool) -> None:
-        """Observe a published needle/controller_status, while joints reach the controller."""
+        """Observe a needle/controller_status published while joints reach the controller."""
         # Before its first step the controller has only the earlier position of the needle.
         steers = status.state == "STEERING" and status.step != 0
         if not (steers and joints_known) or self._before is None:
@@ -236,8 +236,8 @@ class InvariantMonitor:
         off = self._before[1] - status.insertion_m
         if not -0.0005 <= off <= _BELIEF:
             measured = f"the needle is {self._before[1] * 1e3:.2f} mm in"
-            text = f"the controller says {status.insertion_m * 1e3:.2f} mm, {measured}"
-            self.violate("belief_equals_joints", at, text)
+            text = f"the controller reports {status.insertion_m * 1e3:.2f} mm, {measured}"
+            self.violate("depth_matches_joints", at, text)
 
     # ---- checks ---------------------------------------------------------------------------------
 

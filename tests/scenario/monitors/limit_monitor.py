@@ -17,7 +17,7 @@ _SET_POINTS_BEHIND = 3
 _DEPTH_MARGIN, _ROTATION_MARGIN = 0.0011, 0.3
 # Function codes of the process data that carry controlword and mode, and the target (CiA 402).
 _CONTROL, _TARGET = 0x200, 0x300
-# Bits of the controlword that let a drive operate, and cyclic synchronous position mode.
+# Bits of the controlword that enable operation, and cyclic synchronous position mode.
 _OPERATE, _CYCLIC_POSITION = 0x0F, 8
 
 
@@ -34,7 +34,7 @@ class SetPointFrames:
         self._counts_per_unit = counts_per_unit
         self._operates = dict.fromkeys(counts_per_unit, False)
 
-    def take(self, identifier: int, data: bytes) -> tuple[int, float | None] | None:
+    def decode_set_point(self, identifier: int, data: bytes) -> tuple[int, float | None] | None:
         """Return the node id and the set-point of a drive.
 
         Parameters
@@ -73,9 +73,9 @@ class SpeedBudget:
 
     def __init__(self, speed: float) -> None:
         self._speed = speed
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Reset; the next position is the first one."""
         self._least = {1.0: math.inf, -1.0: math.inf}
 
@@ -124,7 +124,7 @@ class LimitMonitor:
     bounds : SafetyLimits
         Limits of the rig.
     late : float
-        Lateness of a set-point; the next one may follow it so much sooner [s].
+        Lateness of a set-point, by which the next interval may be shorter [s].
     """
 
     def __init__(self, bounds: SafetyLimits, late: float = 0.0) -> None:
@@ -160,7 +160,7 @@ class LimitMonitor:
         """
         its = self._axes[axis]
         if position is None:
-            its.set_points.forget()
+            its.set_points.reset()
             return
         ahead, bound = its.set_points.ahead(at, position), its.speed * self._early
         if ahead > bound:

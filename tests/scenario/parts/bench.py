@@ -27,7 +27,7 @@ _LATEST_ANSWER = 3.0
 _CURVATURE = 1.0 / 0.122
 # Largest pieces in which the needle follows the motors [m], [rad].
 _PIECE = 0.0002, 0.1
-# A tip alone says nothing about the heading [rad^2].
+# A tip alone contains no information on the heading [rad^2].
 _UNKNOWN_ORIENTATION = 1e6
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 

@@ -11,7 +11,7 @@ from needle_core.component import Action, Actions, Component, Log, Moment, Port,
 from scenario.faults import PAGE_LINE
 from scenario.parts.page import CONNECT, PageMessage
 
-_LOOK = 0.005
+_POLL_PERIOD = 0.005
 
 
 class VirtualHoldServer(Component):
@@ -25,7 +25,7 @@ class VirtualHoldServer(Component):
         # Connection to page number.
         self._pages: dict[int, int] = {}
         self.ports = (Port(PAGE_LINE, self._handle_batch), Port(PAGE, lambda *_: ()))
-        self.timers = (Timer(_LOOK, self._look), Timer(PERIOD, self._send_counts))
+        self.timers = (Timer(_POLL_PERIOD, self._poll), Timer(PERIOD, self._send_counts))
 
     def _publish_state(self, state: PageHold) -> None:
         self._actions.append(Send(PAGE, (HoldRequest(state, self._protocol.counts()),)))
@@ -37,7 +37,7 @@ class VirtualHoldServer(Component):
         actions, self._actions = self._actions, []
         return actions
 
-    def _look(self, at: Moment) -> Actions:
+    def _poll(self, at: Moment) -> Actions:
         self._protocol.update(at.steady)
         return self._pending_actions()
 

@@ -16,7 +16,7 @@ _RETRY = 1.0
 # Silence after which the link counts as lost [s].
 _SILENCE = 0.5
 # Period in which the page samples the finger and sends [s].
-_LOOK = 0.01
+_POLL_PERIOD = 0.01
 _GARBAGE = ("", "{}", "[1]", '{"count": 1}', "\x00", '{"pressed": true, "speed": 1e999}')
 _KEPT = 50
 CONNECT = "connect"
@@ -42,7 +42,7 @@ class PageMessage:
 @dataclasses.dataclass
 class _Press:
     mode: str
-    # Newest count at its begin.
+    # Newest count at its start.
     after: int
 
 
@@ -80,7 +80,7 @@ class Page(Component):
         self._received_at = -_SILENCE
         self._under_finger = finger()
         self.ports = (Port(PAGE_LINE, self._handle_batch),)
-        self.timers = (Timer(_LOOK, self._look),)
+        self.timers = (Timer(_POLL_PERIOD, self._poll),)
 
     def asks_for_a_new_press(self, now: float) -> bool:
         """Return whether the page shows a lost press or a lost link."""
@@ -98,7 +98,7 @@ class Page(Component):
     # ---- the connection -------------------------------------------------------------------------
 
     def _handle_batch(self, batch: Sequence[PageMessage], at: Moment) -> Actions:
-        # Sample the finger first, as a browser does that was suspended.
+        # Sample the finger first, as a resumed browser does.
         yield from self._update_finger()
         for message in batch:
             if message.connection != self._connection:
@@ -140,7 +140,7 @@ class Page(Component):
 
     # ---- the finger -----------------------------------------------------------------------------
 
-    def _look(self, at: Moment) -> Actions:
+    def _poll(self, at: Moment) -> Actions:
         yield from self._update_finger()
         if self._is_cut:
             self._lose_connection(at.steady)

@@ -198,7 +198,7 @@ class RecorderStandIn(Component):
             Whether to check the bag of a killed recorder: no other fault prevented its writing.
         """
         if self._killed_at is not None:
-            return self._monitor.losses_of_killed(self._killed_at) if check_killed else []
+            return self._monitor.losses_after_kill(self._killed_at) if check_killed else []
         self.recording.close()
         if not self.recording.is_whole:
             if self._refused_at is None:
@@ -206,13 +206,13 @@ class RecorderStandIn(Component):
             if self._refused_at is None:
                 return [f"{self._bag.directory} is not whole: {self.recording.error}"]
             # A disk that refused data leaves the same as a kill.
-            return self._monitor.losses_of_killed(self._refused_at) if check_killed else []
-        return self._monitor.losses_of_ended()
+            return self._monitor.losses_after_kill(self._refused_at) if check_killed else []
+        return self._monitor.losses_after_clean_end()
 
     def _receive(self, topic: str, message: Any, at: Moment) -> Actions:
         self._now = at.steady
         self._count += 1
-        self._monitor.take(at.steady, topic)
+        self._monitor.record(at.steady, topic)
         data = repr(message).encode()
         self.recording.append(Received(topic, data, at.stamp_ns, at.sent_ns, self._count))
         return ()

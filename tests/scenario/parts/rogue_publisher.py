@@ -66,7 +66,7 @@ class RoguePublisher(c.Component):
         return self._chance.choice((math.nan, math.inf, -1e300)) if self._garbage else value
 
     def _hold(self, stamp_ns: int) -> m.HoldState:
-        # Without a session, as from `ros2 topic pub`: only then does a first press count.
+        # No session, as from `ros2 topic pub`: otherwise a first press does not count.
         return m.HoldState("stranger", "", stamp_ns, True, self._number(1.0), m.HOLD_LIFETIME)
 
     def _trajectory(self, stamp_ns: int) -> m.Trajectory:

@@ -20,7 +20,7 @@ EVENTS = {BY_HAND[fault.name]: fault.event for fault in FAULTS if fault.name in 
 
 
 class Person:
-    """Person who answers, and follows each instruction one second later."""
+    """A person who answers, and follows each instruction one second later."""
 
     def __init__(self, rig: ConformanceRig, scale: float = 1.0) -> None:
         self.rig, self.scale = rig, scale
@@ -91,5 +91,5 @@ def test_a_wrong_scale_and_a_long_distance_do_not_pass() -> None:
 
 
 @pytest.mark.parametrize("measured", [0.1, float("nan")])
-def test_an_unknown_distance_is_no_failure(measured: float) -> None:
+def test_an_unknown_distance_is_not_a_failure(measured: float) -> None:
     assert Row("", "", measured, 0.2).passed

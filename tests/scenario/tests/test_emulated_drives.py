@@ -82,7 +82,7 @@ def test_drives_that_report_speeds_in_rpm_home_at_the_requested_speed() -> None:
 
 
 @pytest.mark.parametrize("start", [-0.0005, 0.0, 0.00003])
-def test_homing_from_anywhere_is_no_alarm(start: float) -> None:
+def test_homing_from_anywhere_causes_no_alarm(start: float) -> None:
     rig = VirtualRig(1, drives={"insertion_start": start}, driver={"max_depth": 0.01})
     home(rig)
     assert rig.hand.status.state == "DISABLED"

@@ -36,7 +36,7 @@ client_module = pytest.importorskip("websockets.sync.client", reason="scripts/se
 from needle_bags.live.foxglove_port import FoxglovePort  # noqa: E402
 
 CALIBRATION = Path(__file__).parents[3] / "ros2_ws/src/needle_tracker/config/calibration.yaml"
-PATIENCE = 20.0
+TIMEOUT = 20.0
 TIP_POSE = "/needle/tip_pose"
 # Messages in transit at the end, and before live_view is discovered.
 UNDERWAY = 12
@@ -86,7 +86,7 @@ class Client:
 
     def subscribe(self, channels: int) -> None:
         while len(self._channels) < channels:
-            message = json.loads(self._connection.recv(timeout=PATIENCE))
+            message = json.loads(self._connection.recv(timeout=TIMEOUT))
             for channel in message.get("channels", ()):
                 assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
                 self._channels[channel["id"]] = channel
@@ -97,7 +97,7 @@ class Client:
 
     def read(self, total: int) -> None:
         while self.count < total:
-            data = self._connection.recv(timeout=PATIENCE)
+            data = self._connection.recv(timeout=TIMEOUT)
             kind, number, _ = struct.unpack_from("<BIQ", data)
             assert kind == 1
             self.received[self._channels[number]["topic"]].append(data[13:])
@@ -128,7 +128,7 @@ def stream_and_bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Client, di
     with client_module.connect(uri, subprotocols=["foxglove.sdk.v1"], proxy=None) as connection:
         client = Client(connection)
         client.subscribe(len(view.channels))
-        assert port.all_watched.wait(PATIENCE)
+        assert port.all_watched.wait(TIMEOUT)
         while not runner.run(0.2):
             client.read(port.sent)
         client.read(port.sent)

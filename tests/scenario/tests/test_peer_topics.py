@@ -1,4 +1,4 @@
-"""peer_topics beside a steered rig, read as the code of other packages reads its topics."""
+"""peer_topics of a steered rig, read as other packages read these topics."""
 
 from __future__ import annotations
 

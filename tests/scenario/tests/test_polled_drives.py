@@ -1,4 +1,4 @@
-"""Driver on emulated Galil, Zaber and step/direction drives: what the kit leaves out."""
+"""Driver on emulated Galil, Zaber and step/direction drives: cases not in the kit."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class Careless(Component):
         for left_out in ("device/hold", "joy", "device/status", "sim/drive_positions"):
             rows.pop(left_out, None)
         self.outputs = [Output(row.topic, row.message, row.delivery) for row in rows.values()]
-        # A confirmation that the needle is out may be meant.
+        # A random confirmation that the needle is out may be valid.
         self._offered = [
             service
             for other in others

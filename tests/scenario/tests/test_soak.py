@@ -27,7 +27,7 @@ def ended(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     def results(_: range) -> Iterator[RunResult]:
         yield GOOD
         yield BAD
-        raise AssertionError("nobody asks on")
+        raise AssertionError("no third run expected")
 
     def shrinking(*_: object) -> None:
         signal.raise_signal(signal.SIGINT)
@@ -45,8 +45,8 @@ def test_an_interrupted_soak_reports_its_progress(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     figures, kept = tmp_path / "soak.json", tmp_path / "failures"
-    words = ["--runs", "9", "--json", str(figures), "--failures", str(kept)]
-    assert soak.main(words) == EXIT_INTERRUPTED
+    argv = ["--runs", "9", "--json", str(figures), "--failures", str(kept)]
+    assert soak.main(argv) == EXIT_INTERRUPTED
     output = capsys.readouterr().out
     assert "seed 2:\n  1.000 s estop_stops: it went on" in output
     assert "interrupted: 2 of 9 runs, 1 violate" in output

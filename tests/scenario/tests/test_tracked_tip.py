@@ -76,13 +76,13 @@ class TrackedRig:
         steering: Any = None,
         **settings: Any,
     ) -> None:
-        def see(bench: SimulatedBench, _: SimRigParameters) -> Sensor:
+        def observe(bench: SimulatedBench, _: SimRigParameters) -> Sensor:
             tracker.bench = bench
             return NoSensor()
 
         parameters = command_line_parameters(parse(["--level", "tip"]), Path("none"))
         parameters["plane_controller"] |= steering or {}
-        rig = make_rig(parameters, new_sensor=see)
+        rig = make_rig(parameters, new_sensor=observe)
         operator = settings_of(SimulatedOperatorParameters, parameters, OPERATOR)
         tracked = TrackedTip(TrackedTipParameters(**settings), registration)
         self.tracker, self.target = tracker, rig[-1].settings.target_offset

@@ -1,8 +1,8 @@
-"""A planner: straight to the target, or by a place beside the first obstacle in the way."""
+"""A planner: straight to the target, or via a point next to the first obstacle in the way."""
 
 import numpy as np
 
-# How far beside an obstacle's surface it leads [m]; from farther it may not bend back in time.
+# Clearance from the surface of an obstacle [m]; from farther away it may not bend back in time.
 CLEAR = 0.002
 
 

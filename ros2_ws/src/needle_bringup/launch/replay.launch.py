@@ -8,7 +8,7 @@ under /replay only, so no rig moves. The launch ends with the bag.
 
 from launch import LaunchDescription
 from needle_bringup.ros.launching import describe
-from needle_bringup.simulation.launch_nodes import replay_words, replayed_nodes
+from needle_bringup.simulation.launch_nodes import replay_arguments, replayed_nodes
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -19,4 +19,4 @@ def generate_launch_description() -> LaunchDescription:
         "start": ("0.0", "start this long after the first message [s]"),
         "loop": ("false", "repeat at the end"),
     }
-    return describe(arguments, replayed_nodes, {"loop": ("true", "false")}, replay_words)
+    return describe(arguments, replayed_nodes, {"loop": ("true", "false")}, replay_arguments)

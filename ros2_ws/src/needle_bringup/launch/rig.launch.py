@@ -12,12 +12,12 @@ others end.
 
 from launch import LaunchDescription
 from needle_bringup.ros.launching import describe
-from needle_bringup.simulation.launch_nodes import nodes_beside_rig
+from needle_bringup.simulation.launch_nodes import nodes_alongside_rig
 from needle_core.files.installed import find_shared_file
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the graph beside a rig."""
+    """Return the graph of the nodes that run alongside a rig."""
     calibration = str(find_shared_file("needle_tracker", "config/calibration.yaml"))
     arguments = {
         "calibration": (calibration, "calibration file of the stereo rig"),
@@ -26,4 +26,4 @@ def generate_launch_description() -> LaunchDescription:
         "bag": ("", "new bag; empty: no recording"),
         "params": ("", "parameter file for any node; empty: none"),
     }
-    return describe(arguments, nodes_beside_rig)
+    return describe(arguments, nodes_alongside_rig)

@@ -244,7 +244,7 @@ def report(rows: Sequence[Row], person: str, day: datetime.date) -> str:
     )
     return (
         f"# Commissioning of {day}\n\nMotion of the insertion axis after each event, from the bag "
-        "beside this file; nan: the drive has lost its position.\n\n"
+        "next to this file; nan: the drive has lost its position.\n\n"
         f"| rule | event | measured [mm] | bound [mm] | within |\n| --- | --- | --- | --- | --- |\n"
         f"{table}\nCarried out by {person or '............'}, signature: ............\n"
     )

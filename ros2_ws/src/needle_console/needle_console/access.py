@@ -121,13 +121,13 @@ class Gate:
             await self.app(scope, receive, send)
             return
         send = _forbid_framing(send)
-        why = self._why_not(scope)
+        why = self._refusal_reason(scope)
         if why:
             await _refuse(scope, send, why)
         else:
             await self.app(scope, receive, send)
 
-    def _why_not(self, scope: _Scope) -> str:
+    def _refusal_reason(self, scope: _Scope) -> str:
         why = self._access.host_refusal(_header(scope, b"host"))
         origin = _header(scope, b"origin")
         changes = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD")

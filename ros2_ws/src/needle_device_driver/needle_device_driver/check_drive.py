@@ -1,4 +1,4 @@
-"""`ros2 run needle_device_driver check_drive`: what a drive supports, before it moves a needle."""
+"""`ros2 run needle_device_driver check_drive`: report what a drive supports."""
 
 from __future__ import annotations
 

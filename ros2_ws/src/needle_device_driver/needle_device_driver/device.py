@@ -173,7 +173,7 @@ class DeviceInterface:
 
     def report(self, at: Moment) -> Actions:
         """Publish results and a changed status, log notices; call it after each cycle."""
-        for event in self._supervisor.take_events():
+        for event in self._supervisor.pop_events():
             match event:
                 case m.CommandResult():
                     yield Publish(RESULT, event)

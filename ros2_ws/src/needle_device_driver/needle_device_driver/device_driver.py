@@ -55,7 +55,7 @@ class CycleTimes:
             self._late += between > (1.0 + _LATE) * PERIOD
         self._begun = now
 
-    def take(self) -> dict[str, str]:
+    def pop_figures(self) -> dict[str, str]:
         """Return the number of late cycles, and the longest cycle since the last call."""
         longest, self._longest = self._longest, 0.0
         return {"late_cycles": str(self._late), "longest_cycle_s": f"{longest:.4f}"}
@@ -324,7 +324,7 @@ class DeviceDriver(Component):
             drives.beat()
 
     def _report_health(self, at: Moment) -> Actions:
-        times = self._times.take()
+        times = self._times.pop_figures()
         for drives in self.drives:
             health = drives.health(self.waiting)
             values = {**health.values, **times}

@@ -81,7 +81,7 @@ def test_side_by_side_an_error_cancels_the_others() -> None:
     with pytest.raises(ValueError, match="refused"):
         running.advance(0.1)
     assert one.steps == ["first", "end"]
-    # A cancellation ends all.
+    # A cancellation ends every procedure.
     scripts = Script(), Script()
     running = Running(side_by_side(*(script.procedure() for script in scripts)))
     running.advance(0.0)

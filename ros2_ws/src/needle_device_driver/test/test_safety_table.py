@@ -22,7 +22,7 @@ def test_safety_table_lists_each_rule_and_each_rule_has_a_test() -> None:
     assert "not a certified medical device" in TABLE
 
 
-def test_safety_table_says_which_drive_keeps_which_rule() -> None:
+def test_safety_table_lists_the_rules_that_each_drive_keeps() -> None:
     header = re.search(r"^\| rule \| (cia402 .*) \|$", TABLE, re.MULTILINE)
     assert header
     names = header[1].split(" | ")

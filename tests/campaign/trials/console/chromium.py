@@ -23,7 +23,7 @@ _FLAGS = """\
 --headless=new --no-sandbox --no-first-run --disable-gpu --disable-quic --disable-sync
 --disable-background-networking --disable-component-update --disable-extensions
 --disable-breakpad --disable-dev-shm-usage --remote-debugging-port=0"""
-_PATIENCE = 60.0
+_TIMEOUT = 60.0
 _POLL = 0.02
 _KEY = {"key": " ", "code": "Space", "windowsVirtualKeyCode": 32}
 
@@ -100,7 +100,7 @@ class Chromium:
         number = self.post(method, session, **parameters)
         while True:
             try:
-                answer = json.loads(self._socket.recv(timeout=_PATIENCE))
+                answer = json.loads(self._socket.recv(timeout=_TIMEOUT))
             except TimeoutError as error:
                 raise UserError(f"chromium does not answer {method}") from error
             if answer.get("id") == number:
@@ -131,7 +131,7 @@ class Chromium:
         self._open.close()
 
     def _contents(self, file: Path) -> str:
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + _TIMEOUT
         while True:
             with contextlib.suppress(FileNotFoundError):
                 text = file.read_text("utf-8")

@@ -31,7 +31,7 @@ OPERATOR = "operator"
 _OPERATOR_MODULE = "campaign.trials.holds.piped_pedal"
 _SPEED, _DEPTH_MM = 0.005, 190.0
 _DEEP = 0.17  # from here on, the next trial starts a new rig [m]
-# Latest loss after the begin of the motion, observation time after the return of the source, and
+# Latest loss after the start of the motion, observation time after the return of the source, and
 # time since the last motion of a moving needle [s].
 _LATEST, _BACK, RECENT = 0.4, 2.0, 0.05
 # Shortest and longest loss [s].

@@ -42,19 +42,19 @@ def is_guarded(name: str, type_name: str) -> bool:
     return type_name in _GUARDED_TYPES or name.endswith(_GUARDED_NAMES)
 
 
-def played_name(name: str, type_name: str, *, beside_rig: bool = False) -> str:
+def played_name(name: str, type_name: str, *, alongside_rig: bool = False) -> str:
     """Return the name of a recorded topic during playback.
 
     Parameters
     ----------
     name, type_name : str
         Recorded name and type.
-    beside_rig : bool
+    alongside_rig : bool
         Whether a rig is on the graph; if so, everything is played under `replay/`.
     """
     if name.startswith(f"{REPLAY}/"):
         return name
-    return REPLAY + name if beside_rig or is_guarded(name, type_name) else name
+    return REPLAY + name if alongside_rig or is_guarded(name, type_name) else name
 
 
 def marks_a_rig(name: str) -> bool:

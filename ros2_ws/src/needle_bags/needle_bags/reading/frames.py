@@ -50,9 +50,7 @@ def read_frames(path: str | Path, topics: Collection[str] = ()) -> dict[str, pd.
         # Optional dependency that takes a second to import.
         import pandas as pd  # noqa: PLC0415
     except ModuleNotFoundError as error:
-        raise UserError(
-            "pandas is not installed; docs/viewers.md says how to install it"
-        ) from error
+        raise UserError("pandas is not installed: see docs/viewers.md") from error
     path = Path(path)
     types = {name: topic.type_name for name, topic in read_contents(path).topics.items()}
     for name in topics:

@@ -50,7 +50,7 @@ class RecentMessages:
             if dropped.topic in self._latched:
                 self._last_latched[dropped.topic] = dropped
 
-    def take(self) -> list[Received]:
+    def drain(self) -> list[Received]:
         """Return all kept messages in order and clear the buffer."""
         messages = [*self._last_latched.values(), *self._messages]
         self._last_latched.clear()

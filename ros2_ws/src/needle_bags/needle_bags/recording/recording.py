@@ -121,7 +121,7 @@ class Recording:
         Reason why the recording ended early; None if it did not.
     is_whole : bool
         Whether the bag is complete. If data could not be written, it is not, and `recover`
-        restores what was written.
+        restores the written messages.
     dropped : dict of str to int
         Number of received messages that were not written, by topic.
     """

@@ -59,7 +59,7 @@ def write_report(run: Run, summary: dict[str, JsonValue], directory: Path | None
     summary : dict
         Its figures (`run_summary.summarize`).
     directory : Path, optional
-        Destination; by default the bag's directory, or `<file>_report` beside a single file.
+        Destination; by default the bag's directory, or `<file>_report` next to a single file.
 
     Returns
     -------

@@ -41,7 +41,7 @@ def _ports(settings: LiveViewParameters) -> Mapping[str, RealPort]:
     if not settings.foxglove_port:
         return {}
     if importlib.util.find_spec("foxglove") is None:
-        raise UserError("foxglove-sdk is not installed; docs/viewers.md says how to install it")
+        raise UserError("foxglove-sdk is not installed: see docs/viewers.md")
     from needle_bags.live.foxglove_port import FoxglovePort  # noqa: PLC0415
 
     channels = LiveView(settings, transforms=False).channels

@@ -28,7 +28,7 @@ def main() -> int:
     """Run the node; return its exit code."""
     if importlib.util.find_spec("pyigtl") is None:
         print(
-            "error: pyigtl is not installed; docs/viewers.md says how to install it",
+            "error: pyigtl is not installed: see docs/viewers.md",
             file=sys.stderr,
         )
         return EXIT_BAD_INPUT

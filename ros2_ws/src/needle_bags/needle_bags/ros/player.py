@@ -1,4 +1,4 @@
-"""Plays a bag; nothing of it reaches a rig."""
+"""Plays a bag without affecting a rig."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Player(WholeNode):
         self.clock = PlaybackClock(options.rate, self.start, now, paused=options.paused)
         self._next_clock = 0.0
         self._checked_at = 0.0
-        self.beside_rig = False
+        self.alongside_rig = False
         self.messages = 0
         self.seek_target: int | None = None  # recording time [ns]
         self._begin = self.start
@@ -137,11 +137,11 @@ class Player(WholeNode):
         """
         self._make_publishers()
         begin = time.monotonic()
-        while time.monotonic() < begin + DISCOVERY and not (self.beside_rig or end.requested):
+        while time.monotonic() < begin + DISCOVERY and not (self.alongside_rig or end.requested):
             spin()
             if self._rig() is not None:
                 self.get_logger().warning(f"a rig runs on this graph: playing under {REPLAY}")
-                self.beside_rig = True
+                self.alongside_rig = True
                 self._make_publishers()
                 begin = time.monotonic()
         while time.monotonic() < begin + DISCOVERY + MATCHING and not end.requested:
@@ -159,11 +159,11 @@ class Player(WholeNode):
             self.destroy_publisher(sender)
         self._senders = {name: self._publisher(topic) for name, topic in self._topics.items()}
         if self._options.clock is not None:
-            name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", beside_rig=self.beside_rig)
+            name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", alongside_rig=self.alongside_rig)
             self._senders[CLOCK] = self.create_publisher(Clock, name, RELIABLE)
 
     def _publisher(self, topic: BagTopic) -> Publisher:
-        name = played_name(topic.name, topic.type_name, beside_rig=self.beside_rig)
+        name = played_name(topic.name, topic.type_name, alongside_rig=self.alongside_rig)
         publisher = self.create_publisher(
             message_class(topic.type_name),
             name,
@@ -172,7 +172,7 @@ class Player(WholeNode):
         # ROS remappings apply to this name, so check the final one.
         final = publisher.topic_name
         if not final.startswith(f"{REPLAY}/") and (
-            self.beside_rig
+            self.alongside_rig
             or is_guarded(final, topic.type_name)
             or is_guarded(topic.name, topic.type_name)
         ):
@@ -230,7 +230,7 @@ class Player(WholeNode):
         if now - self._checked_at < CHECK_PERIOD:
             return
         self._checked_at = now
-        rig = None if self.beside_rig else self._rig()
+        rig = None if self.alongside_rig else self._rig()
         if rig is not None:
             raise RigAppearedError(rig)
         state = "paused" if self.clock.is_paused else "playing"

@@ -251,7 +251,7 @@ class Recorder(WholeNode):
             return ""
         self._snapshot_due = None
         seconds = self._recent.seconds
-        messages = self._recent.take()
+        messages = self._recent.drain()
         self.recording.append_all(messages)
         summary = f"{len(messages)} messages of the last {seconds:.1f} s into {self.bag}: {reason}"
         record = {"why": reason, "messages": str(len(messages)), "time_ns": str(time.time_ns())}

@@ -127,12 +127,12 @@ class Node:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `rerun`; return its exit code."""
-    words = sys.argv[1:] if arguments is None else list(arguments)
-    return run_command(lambda: _run(words))
+    argv = sys.argv[1:] if arguments is None else list(arguments)
+    return run_command(lambda: _run(argv))
 
 
-def _run(words: Sequence[str]) -> int:
-    given = _parser().parse_args(words)
+def _run(argv: Sequence[str]) -> int:
+    given = _parser().parse_args(argv)
     file = output_file("--json", given.json)
     if given.output is not None:
         refuse_existing_bag(given.output)

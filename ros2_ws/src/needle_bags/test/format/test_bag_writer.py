@@ -109,7 +109,7 @@ class _BrokenFile(io.FileIO):
 def test_a_failing_disk_is_reported_at_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The error comes before the run, and the next attempt can use the same folder."""
+    """The error precedes the run, and the next attempt can use the same folder."""
     monkeypatch.setattr(BagWriter, "open_file", lambda _, path: _BrokenFile(path, "xb"))
     with pytest.raises(UserError, match=r"cannot record into .*bag: Input/output error"):
         open_recording(tmp_path / "bag")

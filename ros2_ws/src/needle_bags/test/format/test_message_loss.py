@@ -4,7 +4,7 @@ import pytest
 
 from needle_bags.format.message_loss import FINAL_AFTER, SequenceGaps
 
-# Stands between numbers where the publishers have changed.
+# Separates numbers at a change of publishers.
 CHANGED = 0
 
 

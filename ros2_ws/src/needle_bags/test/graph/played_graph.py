@@ -27,7 +27,7 @@ def type_name(kind: type) -> str:
 
 
 def sent(number: int, data: bytes = b"", time_ns: int = 1) -> Taken:
-    """Return what a subscription takes: a message and its DDS metadata."""
+    """Return a received message and its DDS metadata."""
     names = ("source_timestamp", "received_timestamp")
     info = dict.fromkeys(names, time_ns) | {"publication_sequence_number": number}
     return data or str(number).encode(), info
@@ -36,8 +36,10 @@ def sent(number: int, data: bytes = b"", time_ns: int = 1) -> Taken:
 class PlayedSubscription:
     """Subscription whose queue the test fills."""
 
-    def __init__(self, topic: str, take: Callable[..., None], qos: QoSProfile, lost: Any) -> None:
-        self.topic, self.take, self.qos_profile, self.lost = topic, take, qos, lost
+    def __init__(
+        self, topic: str, callback: Callable[..., None], qos: QoSProfile, lost: Any
+    ) -> None:
+        self.topic, self.callback, self.qos_profile, self.lost = topic, callback, qos, lost
         self.waiting: deque[Taken] = deque()
         self.handle = self
 
@@ -142,9 +144,9 @@ class PlayedGraph:
         names = (f"/{self.name}", "/_hidden", *self.parameters)
         return [(name.rpartition("/")[2], name.rpartition("/")[0] or "/") for name in names]
 
-    def _subscribe(self, _: type, topic: str, take: Any, qos: QoSProfile, **how: Any) -> Any:
+    def _subscribe(self, _: type, topic: str, callback: Any, qos: QoSProfile, **how: Any) -> Any:
         lost = how["event_callbacks"].message_lost
-        self.subscriptions.append(PlayedSubscription(topic, take, qos, lost))
+        self.subscriptions.append(PlayedSubscription(topic, callback, qos, lost))
         return self.subscriptions[-1]
 
     def _publisher(self, _: type, topic: str, qos: Any) -> Any:
@@ -185,7 +187,7 @@ class PlayedGraph:
             data = message if isinstance(message, bytes) else serialize_message(message)
             self._sent[topic] += 1
             for one in [one for one in self.subscriptions if one.topic == topic]:
-                one.take(*sent(self._sent[topic], data, round(self.now * 1e9)))
+                one.callback(*sent(self._sent[topic], data, round(self.now * 1e9)))
 
     def answer_all(self) -> None:
         for client in tuple(self.clients):

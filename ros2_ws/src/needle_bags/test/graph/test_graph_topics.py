@@ -37,7 +37,7 @@ class Graph(PlayedGraph):
 
     def receive(self, subscription: PlayedSubscription, *numbers: int) -> None:
         for number in numbers:
-            subscription.take(*sent(number))
+            subscription.callback(*sent(number))
 
     def replace(self, *received: int) -> tuple[PlayedSubscription, PlayedSubscription]:
         """Return a subscription that has received some numbers, and its replacement."""

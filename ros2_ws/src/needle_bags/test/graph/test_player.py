@@ -177,7 +177,7 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     scene.when(15, lambda: scene.change(seek=4.0))
     scene.when(4, lambda: scene.change(seek=4.0))
     scene.when(5, lambda: scene.change(seek=11.0))
-    # The pause at 11 takes no time of the bag.
+    # Bag time stands still during the pause at 11.
     scene.when(11, lambda: scene.pause(True))
     scene.when(11, lambda: scene.at(10.0, lambda: scene.pause(False)))
     scene.when(12, lambda: scene.change(rate=1.1))
@@ -188,7 +188,7 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     assert len(scene.published["/plane"]) == 1 + 4
 
 
-def test_beside_a_rig_everything_is_played_under_replay(scene: Scene) -> None:
+def test_on_a_graph_with_a_rig_everything_is_played_under_replay(scene: Scene) -> None:
     scene.at(1.5, lambda: scene.offer("/device/status", DiagnosticStatus, node="device_driver"))
     assert scene.play("--clock") == 0
     assert any("playing under /replay" in line for line in scene.logged)

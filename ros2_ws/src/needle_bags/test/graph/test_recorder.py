@@ -185,26 +185,26 @@ def test_snapshots_on_request_and_a_second_after_a_fault(scene: Scene) -> None:
     scene.offer(STATUS, DiagnosticStatus, LATCHED)
     answer = Trigger.Response()
 
-    def say(state: str) -> None:
+    def publish_state(state: str) -> None:
         values = [KeyValue(key="state", value=state)]
         scene.send(STATUS, DiagnosticStatus(values=values))
 
     def act() -> None:
         scene.send("/plane", Int32(data=7))
-        say("HOLDING")
+        publish_state("HOLDING")
         # More than the limit: the oldest messages are dropped, latched ones stay.
         scene.send("/numbered", *(Int32(data=number) for number in range(1400)))
         scene.run(0.5)
         assert not int({p.key: p.value for p in scene.health("bag").values}["messages"])
         scene.services["~/snapshot"](Trigger.Request(), answer)
         scene.send("/numbered", Int32(data=-1))
-        say("FAULT")
+        publish_state("FAULT")
         scene.run(0.9)
         scene.send("/numbered", Int32(data=-2))
         scene.run(0.5)
         # The same fault again causes no snapshot.
         scene.send("/numbered", Int32(data=-3))
-        say("FAULT")
+        publish_state("FAULT")
 
     settings = {"snapshot_seconds": 600.0, "snapshot_size": 1_000_000}
     assert scene.record(act, **settings) == 0

@@ -1,4 +1,4 @@
-"""Port that sends the same to all clients, whatever they send and however slowly they read."""
+"""Port that sends the same data to all clients, regardless of their input and reading speed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def read(connection: socket.socket, count: int) -> bytes:
     return connection.recv(count, socket.MSG_WAITALL)
 
 
-def test_all_clients_receive_the_same_whatever_another_sends(server: LinkPort) -> None:
+def test_all_clients_receive_the_same_regardless_of_other_input(server: LinkPort) -> None:
     with pytest.raises(UserError, match=rf"127\.0\.0\.1, port {server.port}: Address already"):
         LinkPort("127.0.0.1", server.port)
     with listener(server) as good:

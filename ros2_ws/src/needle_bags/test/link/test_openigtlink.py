@@ -214,4 +214,4 @@ def test_missing_pyigtl_is_an_error(
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     assert executable.main() == 2
-    assert "pyigtl is not installed; docs/viewers.md" in capsys.readouterr().err
+    assert "pyigtl is not installed: see docs/viewers.md" in capsys.readouterr().err

@@ -119,7 +119,7 @@ def pose(insertion: float) -> NDArray[np.float64]:
 
 
 def steered(insertion: float, *, estimated_to: float) -> Any:
-    """Return a needle with measured tips 1 mm beside the circle, and estimates on it."""
+    """Return a needle with measured tips 1 mm off the circle, and estimates on it."""
     needle: Any = LiveNeedle()
     needle.set_targets(0.0, None)
     for number in range(round(insertion / STEP) + 1):

@@ -1,4 +1,4 @@
-"""live_view in virtual time, with a rig played by the test and viewers that come and go."""
+"""live_view in virtual time, with a rig played by the test and viewers that start and stop."""
 
 from __future__ import annotations
 
@@ -105,13 +105,13 @@ class Scene:
         elif sender == self.view.name and not isinstance(message, m.LogLine):
             self.published.append((output.topic, message))
 
-    def look_at(self, *topics: str) -> Viewer:
+    def open_viewer(self, *topics: str) -> Viewer:
         viewer = Viewer(self.view, topics)
         self.runner.start(viewer)
         self.runner.run(0.5)
         return viewer
 
-    def say(self, topic: str, message: Any) -> None:
+    def publish(self, topic: str, message: Any) -> None:
         self.rig.todo.append(Publish(topic, message))
         self.runner.run(0.3)
 
@@ -128,12 +128,12 @@ def inserted(insertion: float) -> m.JointState:
 def steered() -> Scene:
     """Return a scene with a detected tip, an estimate, a plane and a point."""
     scene = Scene()
-    scene.say("joint_states", inserted(0.04))
+    scene.publish("joint_states", inserted(0.04))
     status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
-    scene.say("needle/controller_status", status)
-    scene.say("needle/tip_pose", pose("rig", 1e-4))
+    scene.publish("needle/controller_status", status)
+    scene.publish("needle/tip_pose", pose("rig", 1e-4))
     # In the frame of the plane, offset by 3 mm.
-    scene.say("needle/estimate", pose("target_plane", 2e-4))
+    scene.publish("needle/estimate", pose("target_plane", 2e-4))
     return scene
 
 
@@ -143,14 +143,14 @@ def shown(markers: m.Markers) -> dict[str, m.Marker]:
 
 def test_known_quantities_are_drawn_and_the_others_deleted() -> None:
     scene = Scene()
-    received = scene.look_at(live_view.MARKERS, live_view.TIP, live_view.PATH).received
+    received = scene.open_viewer(live_view.MARKERS, live_view.TIP, live_view.PATH).received
     markers = received[live_view.MARKERS]
     status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
-    scene.say("needle/controller_status", status)
+    scene.publish("needle/controller_status", status)
     assert set(shown(markers[-1])) == {"plane", "target_point"}
     assert len(markers[-1].markers) == 6
-    scene.say("joint_states", inserted(0.04))
-    scene.say("needle/tip_pose", pose("rig", 1e-4))
+    scene.publish("joint_states", inserted(0.04))
+    scene.publish("needle/tip_pose", pose("rig", 1e-4))
     there = shown(markers[-1])
     assert there["shaft"].points[-1] == TIP
     assert there["uncertainty"].scale == pytest.approx((2 * 2.7955e-4,) * 3)
@@ -159,19 +159,19 @@ def test_known_quantities_are_drawn_and_the_others_deleted() -> None:
     assert there["plane"].stamp_ns == pytest.approx(scene.runner.timeline.stamp_ns, abs=2e8)
     assert received[live_view.TIP][-1] == m.Pose(EXPOSED, "rig", TIP, UPRIGHT)
     assert received[live_view.PATH][-1].positions[-1] == TIP
-    scene.say("needle/estimate", pose("target_plane", 2e-4))
+    scene.publish("needle/estimate", pose("target_plane", 2e-4))
     there = shown(markers[-1])
     assert there["estimate"].points[0] == pytest.approx((TIP[0] + 0.003, *TIP[1:]))
     assert there["uncertainty"].scale == pytest.approx((4 * 2.7955e-4,) * 3)
     # A tip that was not found is grey.
-    scene.say("needle/tip_pose", pose("rig", np.inf, 2 * EXPOSED))
+    scene.publish("needle/tip_pose", pose("rig", np.inf, 2 * EXPOSED))
     assert shown(markers[-1])["tip"].colour == (0.7, 0.7, 0.7, 1.0)
 
 
 def test_topics_without_subscriber_are_not_published() -> None:
     scene = steered()
     assert scene.published == []
-    scene.look_at(live_view.PATH)
+    scene.open_viewer(live_view.PATH)
     assert {topic for topic, _ in scene.published} == {live_view.PATH}
     scene.runner.stop("viewer")
     scene.runner.run(0.5)
@@ -191,7 +191,7 @@ def test_topics_without_subscriber_are_not_published() -> None:
 
 def test_implausible_messages_are_rejected() -> None:
     scene = steered()
-    markers = scene.look_at(live_view.MARKERS).received[live_view.MARKERS]
+    markers = scene.open_viewer(live_view.MARKERS).received[live_view.MARKERS]
     before = shown(markers[-1])
     for topic, message in (
         ("joint_states", inserted(1e300)),
@@ -203,7 +203,7 @@ def test_implausible_messages_are_rejected() -> None:
         ("target_plane", m.Pose(1, "elsewhere", (0.0, 0.0, 0.0), UPRIGHT)),
         ("stereo_tracker/calibration", m.Text("none")),
     ):
-        scene.say(topic, message)
+        scene.publish(topic, message)
         assert scene.health[topic].startswith("refused: ")
         assert "handlers" not in scene.health
         after = shown(markers[-1])
@@ -211,7 +211,7 @@ def test_implausible_messages_are_rejected() -> None:
         assert after["shaft"].points == before["shaft"].points
         assert after.keys() == before.keys()
     # Health recovers with a good message.
-    scene.say("joint_states", inserted(0.04))
+    scene.publish("joint_states", inserted(0.04))
     assert scene.health["joint_states"] == "ok"
 
 
@@ -234,10 +234,10 @@ def black(stamp_ns: int) -> m.Image:
 
 def test_an_image_is_drawn_with_its_answer(left_view: Projection) -> None:
     scene = steered()
-    scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-    pictures = scene.look_at(LEFT).received[LEFT]
+    scene.publish("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
+    pictures = scene.open_viewer(LEFT).received[LEFT]
     scene.rig.todo.append(Publish(RAW, black(2 * EXPOSED)))
-    scene.say("needle/tip_pose", pose("rig", 1e-4, 2 * EXPOSED))
+    scene.publish("needle/tip_pose", pose("rig", 1e-4, 2 * EXPOSED))
     (received,) = pictures
     assert (received.stamp_ns, received.format) == (2 * EXPOSED, "jpeg")
     assert received.frame_id == "left_camera_optical"
@@ -253,8 +253,8 @@ def test_an_image_is_drawn_with_its_answer(left_view: Projection) -> None:
 
 def test_images_of_another_camera_or_before_a_subscription_are_not_shown() -> None:
     scene = Scene()
-    scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-    scene.say(RAW, black(1))
+    scene.publish("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
+    scene.publish(RAW, black(1))
     first = Viewer(scene.view, [LEFT])
     scene.runner.start(first)
     scene.runner.run(0.25)
@@ -262,13 +262,13 @@ def test_images_of_another_camera_or_before_a_subscription_are_not_shown() -> No
     scene.rig.todo.append(Publish(RAW, black(2)))
     scene.runner.run(0.05)
     scene.runner.stop("viewer")
-    scene.say(RAW, black(3))
-    pictures = scene.look_at(LEFT).received[LEFT]
+    scene.publish(RAW, black(3))
+    pictures = scene.open_viewer(LEFT).received[LEFT]
     scene.runner.run(1.0)
     assert pictures == []
-    scene.say(RAW, m.Image(1, "", 2, 3, "mono8", 3, bytes(6)))
+    scene.publish(RAW, m.Image(1, "", 2, 3, "mono8", 3, bytes(6)))
     assert "the calibration is for" in scene.health[RAW]
-    scene.say(RAW, black(4))
+    scene.publish(RAW, black(4))
     scene.runner.run(1.0)
     assert [picture.stamp_ns for picture in pictures] == [4]
     assert first.received[LEFT] == []
@@ -280,13 +280,13 @@ def test_images_of_another_camera_or_before_a_subscription_are_not_shown() -> No
 def test_transforms_are_published_if_the_message_type_is_installed() -> None:
     scene = Scene(transforms=True)
     assert Output(live_view.TF_STATIC, m.Transforms, LATCHED) in scene.view.outputs
-    scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-    received = scene.look_at(live_view.TF, live_view.TF_STATIC).received
+    scene.publish("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
+    received = scene.open_viewer(live_view.TF, live_view.TF_STATIC).received
     assert len(received[live_view.TF_STATIC]) == 1
     # Nothing is sent before there is data.
     assert received[live_view.TF] == []
-    scene.say("needle/controller_status", ControllerStatus(target_offset_m=0.003))
-    scene.say("needle/tip_pose", pose("rig", 1e-4))
+    scene.publish("needle/controller_status", ControllerStatus(target_offset_m=0.003))
+    scene.publish("needle/tip_pose", pose("rig", 1e-4))
     plane, tip = received[live_view.TF][-1].transforms
     assert (plane.child_frame_id, plane.translation) == ("target_plane", (0.003, 0.0, 0.0))
     assert tip == m.Transform(EXPOSED, "rig", "needle_tip", TIP, UPRIGHT)
@@ -298,16 +298,16 @@ def test_transforms_are_published_if_the_message_type_is_installed() -> None:
 def test_clients_receive_watched_topics_and_latched_ones_alone(left_view: Projection) -> None:
     scene, clients = Scene(foxglove_port=1), Clients()
     scene.runner.start(clients)
-    scene.look_at(live_view.PATH)
+    scene.open_viewer(live_view.PATH)
 
     def received() -> set[str]:
         clients.received.clear()
-        scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-        scene.say("needle/controller_status", ControllerStatus(target_offset_m=0.003))
-        scene.say("joint_states", inserted(0.04))
-        scene.say("needle/reduced_state", m.Vector(1, "target_plane", TIP))
+        scene.publish("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
+        scene.publish("needle/controller_status", ControllerStatus(target_offset_m=0.003))
+        scene.publish("joint_states", inserted(0.04))
+        scene.publish("needle/reduced_state", m.Vector(1, "target_plane", TIP))
         scene.rig.todo.append(Publish(RAW, black(EXPOSED)))
-        scene.say("needle/tip_pose", pose("rig", 1e-4))
+        scene.publish("needle/tip_pose", pose("rig", 1e-4))
         return {topic for topic, _, _ in clients.received}
 
     latched = {"needle/controller_status", live_view.TF_STATIC, live_view.ROBOT_DESCRIPTION}

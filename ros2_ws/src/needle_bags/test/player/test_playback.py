@@ -57,7 +57,7 @@ def test_topics_that_control_a_rig_are_played_under_replay(name: str, type_name:
 def test_other_topics_keep_their_names_unless_a_rig_runs() -> None:
     for name in ("/needle/tip", "/joint_states", "/clock", "/my_target_plane"):
         assert played_name(name, POINT) == name
-        assert played_name(name, POINT, beside_rig=True) == f"/replay{name}"
+        assert played_name(name, POINT, alongside_rig=True) == f"/replay{name}"
     assert marks_a_rig("/bench/device/status")
     assert not marks_a_rig("/replay/device/status")
 

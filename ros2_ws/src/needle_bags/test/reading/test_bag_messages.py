@@ -34,7 +34,7 @@ def order(bag: Path) -> list[str]:
     return [sent.topic for sent in raw_as_sent(bag, lambda _: True)]
 
 
-def test_a_late_question_still_comes_before_its_answer(tmp_path: Path) -> None:
+def test_a_late_request_still_precedes_its_answer(tmp_path: Path) -> None:
     def delay(topic: str, number: int) -> int:
         return 5 * MILLISECOND if topic == QUESTIONS and number % 3 else 0
 

@@ -70,7 +70,7 @@ def test_health_is_that_of_the_selected_rig() -> None:
 
 
 def test_holds_of_two_sessions_are_stamped_by_arrival() -> None:
-    # The first message of each.
+    # The first message of each session.
     header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=1))
     joy = SimpleNamespace(header=header, axes=[0.5], buttons=[1])
     holds = _series("holds", [(10, joy), (20, joy)])

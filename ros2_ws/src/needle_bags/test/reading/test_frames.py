@@ -70,7 +70,7 @@ def test_rows_agree_with_the_typed_reader(rows: dict[str, list[dict[str, Any]]])
 
 def test_missing_dependencies_and_topics_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(UserError, match=r"pandas is not installed; docs/viewers\.md"):
+    with pytest.raises(UserError, match=r"pandas is not installed: see docs/viewers\.md"):
         read_frames(BAG)
     monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace())
     with pytest.raises(UserError, match=r"no topic /needle/top \(it has /device/hold, "):

@@ -15,7 +15,7 @@ def test_the_last_seconds_are_kept() -> None:
     recent = RecentMessages(2.0, 10**9)
     for tenth in range(100):
         recent.put(message("/a", 0.1 * tenth))
-    kept = recent.take()
+    kept = recent.drain()
     assert [m.log_time for m in kept] == [round(0.1 * t * SECOND) for t in range(79, 100)]
-    assert recent.take() == []
+    assert recent.drain() == []
     assert recent.memory == 0

@@ -95,7 +95,7 @@ def test_unchanged_code_gives_unchanged_outputs(
     assert code == 0, f"{output}\nmeant? scripts/renew_regression_bag"
     assert "6 image pairs through stereo_tracker, 121 tips through plane_controller" in output
     assert "UNCHANGED" in output
-    # The table for reviewers of a diff must match the bag beside it.
+    # The table for reviewers of a diff must match the bag in the same folder.
     rows = (regression / TABLE).read_text().splitlines()[1:]
     assert len(rows) == read_contents(regression).counts["/needle/estimate"]
 

@@ -149,10 +149,10 @@ class Operator(Component):
 
     def _health(self) -> tuple[Level, str]:
         decision = self._decision
-        if decision.trouble:
-            return Level.WARN, f"nothing is held: {decision.trouble}"
-        if self._retraction.trouble:
-            return Level.WARN, f"not withdrawn: {self._retraction.trouble}"
+        if decision.problem:
+            return Level.WARN, f"nothing is held: {decision.problem}"
+        if self._retraction.problem:
+            return Level.WARN, f"not withdrawn: {self._retraction.problem}"
         if decision.ignored_press:
             return Level.WARN, "the press is ignored: release all buttons, then press again"
         if self._release_required and decision.kind is not HoldKind.NOTHING:

@@ -68,7 +68,7 @@ class HoldDecision:
         Share of the nominal speed, 0..1.
     stop : bool
         Whether a stop was just requested.
-    trouble : str
+    problem : str
         Reason why there is no input; empty if there is input.
     ignored_press : bool
         Whether a button is down but ignored until all buttons are released.
@@ -77,7 +77,7 @@ class HoldDecision:
     kind: HoldKind = HoldKind.NOTHING
     speed: float = 0.0
     stop: bool = False
-    trouble: str = ""
+    problem: str = ""
     ignored_press: bool = False
 
 
@@ -102,7 +102,7 @@ class HoldDebouncer:
         if isinstance(reading, InputLost):
             self._release()
             self._stopping = False
-            return HoldDecision(trouble=reading.reason)
+            return HoldDecision(problem=reading.reason)
         if gap > MAX_GAP:
             self._release()
         new_stop, self._stopping = reading.stop and not self._stopping, reading.stop

@@ -60,7 +60,7 @@ class JoySource:
         publishers : int
             Number of publishers of the topic; with several, none is used.
         """
-        reason = self._why_lost(now, publishers)
+        reason = self._loss_reason(now, publishers)
         if reason:
             return InputLost(reason)
         settings = self._settings
@@ -72,7 +72,7 @@ class JoySource:
         )
         return InputState(insert=insert, retract=retract, stop=stop, speed=speed)
 
-    def _why_lost(self, now: float, publishers: int) -> str:
+    def _loss_reason(self, now: float, publishers: int) -> str:
         """Return the reason why the last message is invalid; empty if it is valid."""
         last, axis = max(self._settings.keys), self._settings.speed_axis
         has, axes = "the joystick's message has", len(self._axes)

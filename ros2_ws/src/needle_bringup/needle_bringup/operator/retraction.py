@@ -55,7 +55,7 @@ class RetractionSequence:
         self._call: str | None = None
         self._owner = ""
         self._activity = ""
-        self.trouble = ""
+        self.problem = ""
 
     @property
     def holds(self) -> bool:
@@ -102,7 +102,7 @@ class RetractionSequence:
             The service to call now; pass its answer to `handle_answer`.
         """
         if not held:
-            self._phase, self._call, self.trouble = _Phase.IDLE, None, ""
+            self._phase, self._call, self.problem = _Phase.IDLE, None, ""
             return None
         if self._phase is _Phase.IDLE and controller:
             self._enter(_Phase.STEERING_ENDS, now, call=STOP_STEERING)
@@ -113,9 +113,9 @@ class RetractionSequence:
         call, self._call = self._call, None
         return call
 
-    def _give_up(self, trouble: str, now: float) -> None:
+    def _give_up(self, problem: str, now: float) -> None:
         self._enter(_Phase.OVER, now)
-        self.trouble = trouble
+        self.problem = problem
 
     def _enter(self, phase: _Phase, now: float, call: str | None = None) -> None:
         self._phase, self._since, self._call = phase, now, call

@@ -91,8 +91,8 @@ class ConsoleOptions:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `console`; return its exit code."""
-    words = sys.argv[1:] if arguments is None else arguments
-    return run_command(lambda: console(parse_console(words)))
+    argv = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: console(parse_console(argv)))
 
 
 def parse_console(arguments: Sequence[str]) -> ConsoleOptions:
@@ -114,14 +114,14 @@ def parse_console(arguments: Sequence[str]) -> ConsoleOptions:
     for option, (metavar, text) in _SHARED.items():
         parser.add_argument(option, metavar=metavar, help=text)
     given = parser.parse_args(join_signed_values(arguments))
-    words = ["--graph"] if given.graph else ["--real-time-factor", "1"]
-    words += ["--insertion", "continuous"]
+    argv = ["--graph"] if given.graph else ["--real-time-factor", "1"]
+    argv += ["--insertion", "continuous"]
     for option in _SHARED:
         value = getattr(given, option[2:].replace("-", "_"))
         if value is not None:
-            words.append(f"{option}={value}")
+            argv.append(f"{option}={value}")
     port = whole_number("--port", given.port, 1, _LAST_PORT)
-    return ConsoleOptions(port, parse(words))
+    return ConsoleOptions(port, parse(argv))
 
 
 def console(options: ConsoleOptions) -> int:

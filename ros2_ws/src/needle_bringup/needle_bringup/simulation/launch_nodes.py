@@ -83,13 +83,13 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     UserError
         If an argument is invalid, a file is missing, or the bag exists.
     """
-    words = ["--graph"]
+    argv = ["--graph"]
     for name in ("level", "seed", "controller"):
-        words += [f"--{name}", arguments[name]]
+        argv += [f"--{name}", arguments[name]]
     bag = _new_bag(arguments["bag"])
     given = [f"{name}:={value}" for name, value in arguments.items() if value and name != "bag"]
     command = shlex.join(["ros2", "launch", "needle_bringup", "simulation.launch.py", *given])
-    parameters = command_line_parameters(parse(words), bag or Path(), f"{command} bag:=NEW")
+    parameters = command_line_parameters(parse(argv), bag or Path(), f"{command} bag:=NEW")
     for name, parameter in (("drive_emulator", "pty"), ("device_driver", "channel")):
         if name in parameters:
             parameters[name][parameter] = arguments["can"]
@@ -101,7 +101,7 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     return _with_file(parameters, arguments, _RESERVED_BY_SIMULATION)
 
 
-def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
+def nodes_alongside_rig(arguments: Mapping[str, str]) -> Parameters:
     """Return the nodes of rig.launch.py.
 
     Parameters
@@ -160,7 +160,7 @@ def replayed_nodes(arguments: Mapping[str, str]) -> Parameters:
     return {"player": {}, "live_view": {}}
 
 
-def replay_words(arguments: Mapping[str, str]) -> dict[str, list[str]]:
+def replay_arguments(arguments: Mapping[str, str]) -> dict[str, list[str]]:
     """Return the command line arguments of the nodes of replay.launch.py.
 
     Parameters

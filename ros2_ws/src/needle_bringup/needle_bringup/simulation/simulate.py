@@ -51,8 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run `simulate`; return its exit code."""
     if STARTED_AT in os.environ:
         _end_with_parent()
-    words = sys.argv[1:] if arguments is None else arguments
-    return run_command(lambda: simulate(parse(words)))
+    argv = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: simulate(parse(argv)))
 
 
 def simulate(options: SimulateOptions) -> int:
@@ -242,7 +242,7 @@ def _make_folder(options: SimulateOptions) -> Path:
 
 
 def _checkout() -> Path:
-    """Return the checkout, or the current folder of an installed package."""
+    """Return the checkout; for an installed package, the current folder."""
     with contextlib.suppress(UserError):
         return checkout()
     return Path.cwd()

@@ -182,20 +182,20 @@ def command_of(options: SimulateOptions) -> str:
         depth_mm=float(DEPTH_MM) if options.target_mm is None else LARGEST_DEPTH_MM,
     )
     start_mm_deg = (options.initial_x_mm, options.initial_pitch_deg, options.initial_roll_deg)
-    words = [f"--level={options.level}", f"--controller={options.controller}"]
-    words.append(f"--seed={options.seed}")
+    argv = [f"--level={options.level}", f"--controller={options.controller}"]
+    argv.append(f"--seed={options.seed}")
     if start_mm_deg != (plain.initial_x_mm, plain.initial_pitch_deg, plain.initial_roll_deg):
-        words.append(f"--initial={_joined(start_mm_deg)}")
+        argv.append(f"--initial={_joined(start_mm_deg)}")
     if options.target_mm is not None:
-        words.append(f"--target={_joined(options.target_mm)}")
+        argv.append(f"--target={_joined(options.target_mm)}")
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
         if field.name not in _SPECIAL and value != getattr(plain, field.name):
-            words.append(f"--{field.name.replace('_', '-')}={value}")
+            argv.append(f"--{field.name.replace('_', '-')}={value}")
     if options.graph:
-        words.append("--graph")
-    words += [f"--component={name}" for name in options.component]
-    return shlex.join(["scripts/simulate", *words])
+        argv.append("--graph")
+    argv += [f"--component={name}" for name in options.component]
+    return shlex.join(["scripts/simulate", *argv])
 
 
 def _joined(numbers: Sequence[float]) -> str:

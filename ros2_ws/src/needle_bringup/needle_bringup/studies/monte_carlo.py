@@ -46,8 +46,8 @@ LABELS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `monte_carlo`; return its exit code."""
-    words = sys.argv[1:] if arguments is None else arguments
-    return run_command(lambda: monte_carlo(parse(words)))
+    argv = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: monte_carlo(parse(argv)))
 
 
 def monte_carlo(options: MonteCarloOptions) -> int:

@@ -1,4 +1,4 @@
-"""Random floors behind a needle, and clutter beside or in front of it.
+"""Random floors behind a needle, and clutter next to or in front of it.
 
 The ranges are wide, so that the net generalizes. This code is independent of the renderer in
 needle_sim, with which the tracker is tested.

@@ -86,7 +86,7 @@ def random_pose(rng: np.random.Generator, size: int, radius: float) -> Pose:
 
 
 def coarse(fine: Image) -> Image:
-    """Reduce a fine image to pixels."""
+    """Average a supersampled image to pixels."""
     size = len(fine) // _FINE
     return np.asarray(cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA), np.float32)
 

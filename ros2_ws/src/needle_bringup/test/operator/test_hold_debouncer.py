@@ -26,7 +26,7 @@ READINGS = (NEUTRAL, INSERT, RETRACT, BOTH, InputState(stop=True), STOPPED, Inpu
 moments = st.tuples(st.sampled_from(READINGS), st.sampled_from((CYCLE, CYCLE, CYCLE, 0.15)))
 JOYSTICK = OperatorParameters("joy", key=0, retract_key=2, speed_axis=1, axis_at_zero=0.0)
 
-NO_HANDS: tuple[tuple[int, list[float], list[int], str], ...] = (
+INVALID_JOY_MESSAGES: tuple[tuple[int, list[float], list[int], str], ...] = (
     (2, [0.0, 1.0], [1, 0, 0], "2 nodes publish"),
     (1, [0.0, 1.0], [1, 0], "has 2 buttons, but no 2"),
     (1, [0.0], [1, 0, 0], "has 1 axes, but no 1"),
@@ -55,7 +55,7 @@ def test_only_a_new_press_from_neutral_is_accepted(seen: list[tuple[InputReading
         now += gap
         decision = debouncer.update(reading, now)
         assert decision.kind is counts(seen[: number + 1])
-        assert bool(decision.trouble) is isinstance(reading, InputLost)
+        assert bool(decision.problem) is isinstance(reading, InputLost)
 
 
 def test_a_stop_is_requested_once_per_press_also_after_a_loss_and_ends_the_hold() -> None:
@@ -108,7 +108,7 @@ def test_an_overtaken_message_is_ignored() -> None:
     source.receive([0.0, 1.0], [0, 0, 0], 5.05, stamp=99.98)
     assert source.reading(5.05) == InputState(insert=True, speed=0.5)
     assert isinstance(source.reading(5.00 + 1.001 * JOY_TIMEOUT), InputLost)
-    # A sender whose clock was set back counts again after a silence; without stamps, at once.
+    # A sender whose clock was set back is accepted after a silence; without stamps, at once.
     source.receive([0.0, 1.0], [0, 0, 0], 5.11, stamp=40.00)
     assert source.reading(5.11) == InputState(speed=0.5)
     source.receive([0.0, 1.0], [1, 0, 0], 5.13)
@@ -116,7 +116,7 @@ def test_an_overtaken_message_is_ignored() -> None:
 
 
 def test_an_invalid_message_is_a_loss_of_the_joystick() -> None:
-    for publishers, axes, buttons, why in NO_HANDS:
+    for publishers, axes, buttons, why in INVALID_JOY_MESSAGES:
         source = Joystick()
         source.receive(axes, buttons, 5.0)
         read = source.reading(5.0, publishers)

@@ -107,10 +107,10 @@ HOLD, STOPPED, NOTHING = (
     InputState(speed=0.8),
 )
 # Events before each reading, and the expected reading.
-LOOKS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
+READINGS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
     # A held pedal sends nothing.
     (((KEY, DOWN), HOLD), ((), HOLD), ((KEY, UP), NOTHING)),
-    # Key repeat is no press.
+    # Key repeat is not a press.
     (((KEY, REPEAT, UP), NOTHING), ((STOP, REPEAT, UP), NOTHING)),
     # A release between two readings is detected.
     (((KEY, DOWN), HOLD), ((KEY, UP, DOWN), NOTHING), ((), HOLD)),
@@ -120,10 +120,10 @@ LOOKS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
 
 
 def test_a_reading_ignores_key_repeat() -> None:
-    for looks in LOOKS:
+    for readings in READINGS:
         pedal = PedalPort()
         assert pedal.read() == NOTHING
-        for done, wanted in looks:
+        for done, wanted in readings:
             if done:
                 pedal.do(*done)
             assert pedal.read() == wanted
@@ -192,7 +192,7 @@ def test_an_axis_sets_the_speed_up_to_the_scale() -> None:
         assert read.speed == pytest.approx(0.8 * share)
 
 
-def test_a_file_that_is_no_input_device_is_rejected() -> None:
+def test_a_file_that_is_not_an_input_device_is_rejected() -> None:
     for path in ("/dev/null", "/dev/input/that_is_not_there"):
         with pytest.raises(OSError, match=r"no input device|No such file"):
             InputDevice(path)

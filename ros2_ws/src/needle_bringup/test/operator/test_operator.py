@@ -43,13 +43,13 @@ class Scene:
         self.called: list[str] = []
         self.logs: list[str] = []
         peers = Peers({"joy": ("joy_node",)}, services=frozenset({STOP_STEERING, RETRACT, STOP}))
-        self.take(self.operator.on_peers(peers, self.at))
+        self.execute(self.operator.on_peers(peers, self.at))
 
     @property
     def at(self) -> Moment:
         return Moment(self.now, round(self.now * 1e9))
 
-    def take(self, actions: Iterable[Action]) -> None:
+    def execute(self, actions: Iterable[Action]) -> None:
         for action in actions:
             if isinstance(action, Publish):
                 self.holds.append(action.message)
@@ -57,7 +57,7 @@ class Scene:
                 self.logs.append(action.text)
             elif isinstance(action, Call):
                 self.called.append(action.service)
-                self.take(self.operator.on_answer(Answer(action.service, True, ""), self.at))
+                self.execute(self.operator.on_answer(Answer(action.service, True, ""), self.at))
             else:
                 assert isinstance(action, Diagnose)
 
@@ -66,8 +66,8 @@ class Scene:
         self.now += PERIOD
         (row,), (port,) = self.operator.inputs, self.operator.ports
         if status:
-            self.take(row.handler(DeviceStatus(**status), self.at))
-        self.take(port.handler((InputLost("an older reading"), reading), self.at))
+            self.execute(row.handler(DeviceStatus(**status), self.at))
+        self.execute(port.handler((InputLost("an older reading"), reading), self.at))
         return self.holds[-1]
 
     def joy(self, *down: int, silent: bool = False) -> m.HoldState:
@@ -76,8 +76,8 @@ class Scene:
         buttons = tuple(int(button in down) for button in range(3))
         if not silent:
             message = m.Joystick(self.at.stamp_ns, (0.6,), buttons)
-            self.take(self.operator.inputs[1].handler(message, self.at))
-        self.take(self.operator.timers[0].handler(self.at))
+            self.execute(self.operator.inputs[1].handler(message, self.at))
+        self.execute(self.operator.timers[0].handler(self.at))
         return self.holds[-1]
 
 

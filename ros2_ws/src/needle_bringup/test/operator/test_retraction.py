@@ -25,7 +25,7 @@ def holds(retraction: RetractionSequence) -> bool:
 def at_step(steps: int) -> RetractionSequence:
     """Return the retraction of a button after a number of steps, at 1 s.
 
-    Steps: the controller has stopped, the device was told to retract, and it has agreed.
+    Steps: the controller has stopped, the device was asked to retract, and it has accepted.
     """
     retraction = RetractionSequence("operator")
     retraction.handle_device("", "none", 0.0)
@@ -55,7 +55,7 @@ def test_the_hold_ends_with_the_retraction() -> None:
         retraction.handle_device("operator", "none", 61.0)
         assert retraction.update(True, 61.1, controller=False) is None
         assert not holds(retraction)
-        assert retraction.trouble == ""
+        assert retraction.problem == ""
 
 
 def test_without_a_controller_the_hold_starts_immediately() -> None:
@@ -78,14 +78,14 @@ def test_a_refusal_ends_the_hold_and_is_reported() -> None:
         retraction = at_step(steps)
         retraction.handle_answer(service, False, "not now", 1.2)
         assert not holds(retraction)
-        assert retraction.trouble == f"{service} was refused: not now"
+        assert retraction.problem == f"{service} was refused: not now"
 
 
 def test_a_timeout_ends_the_hold() -> None:
     for steps, cause in enumerate(IN_VAIN):
         retraction = at_step(steps)
         assert retraction.update(True, 1.0 + 0.99 * STEP_TIMEOUT, controller=True) is None
-        assert not retraction.trouble
+        assert not retraction.problem
         retraction.update(True, 1.0 + 1.01 * STEP_TIMEOUT, controller=True)
         assert not holds(retraction)
-        assert cause in retraction.trouble
+        assert cause in retraction.problem

@@ -86,12 +86,12 @@ def test_bad_arguments_give_a_one_line_error_and_exit_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("", "utf-8")
-    for words, cause in (
+    for argv, cause in (
         (["--seed", "-1"], "--seed"),
         (["--json", "/nowhere/f.json"], "/nowhere/f.json"),
         (["--out", str(tmp_path / "file")], "--out"),
     ):
-        assert main(words) == 2
+        assert main(argv) == 2
         captured = capsys.readouterr()
         assert len(captured.err.strip().splitlines()) == 1
         assert cause in captured.err
@@ -130,8 +130,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_results, "Laboratory", MadeUpLaboratory)
-        words = ["--quick", "--out", str(folder / "out"), "--json", str(folder / "figures.json")]
-        assert main(words) == 0
+        argv = ["--quick", "--out", str(folder / "out"), "--json", str(folder / "figures.json")]
+        assert main(argv) == 0
     return folder
 
 

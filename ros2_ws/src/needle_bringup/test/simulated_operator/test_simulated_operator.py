@@ -1,4 +1,4 @@
-"""simulated_operator: calls, holds, failures, and when it must not act."""
+"""simulated_operator: calls, holds, failures, and situations in which it must not act."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ class Scene:
         topics = {"device/status": devices, "needle/controller_status": (RIG,)}
         services = frozenset(call.service for call in PREPARATION) - {missing}
         peers = Peers(topics, {"device/hold": devices}, services, frozenset({"sim_rig", NAME}))
-        self.take(self.operator.on_peers(peers, moment(0.0)))
+        self.execute(self.operator.on_peers(peers, moment(0.0)))
 
-    def take(self, actions: Iterable[Action]) -> None:
+    def execute(self, actions: Iterable[Action]) -> None:
         for action in actions:
             match action:
                 case Publish():
@@ -69,18 +69,18 @@ class Scene:
 
     def device(self, status: DeviceStatus, now: float = 1.0, **changes: Any) -> None:
         message = dataclasses.replace(status, **changes)
-        self.take(self.rows["device/status"](message, moment(now)))
+        self.execute(self.rows["device/status"](message, moment(now)))
 
     def controller(self, now: float = 2.0, **changes: Any) -> None:
         message = dataclasses.replace(STEERING, **changes)
-        self.take(self.rows["needle/controller_status"](message, moment(now)))
+        self.execute(self.rows["needle/controller_status"](message, moment(now)))
 
     def answer(self, call: Call, now: float = 1.0, text: str = "", *, success: bool = True) -> None:
-        self.take(self.operator.on_answer(Answer(call.service, success, text), moment(now)))
+        self.execute(self.operator.on_answer(Answer(call.service, success, text), moment(now)))
 
-    def look(self, now: float = 1.0) -> list[Call]:
-        """Run the timer; return the calls since the last look."""
-        self.take(self.operator.timers[0].handler(moment(now)))
+    def run_timer(self, now: float = 1.0) -> list[Call]:
+        """Run the timer; return the calls since the last call."""
+        self.execute(self.operator.timers[0].handler(moment(now)))
         calls, self.calls = self.calls, []
         return calls
 
@@ -90,14 +90,14 @@ class Scene:
 
     def failure(self, now: float = 50.0) -> str:
         """Return why the run failed; the hold is released, and an enabled device disabled."""
-        if self.look(now):
+        if self.run_timer(now):
             assert [hold.pressed for hold in self.holds[-3:]] == [False] * 3
             assert self.ends == []
             self.answer(DISABLE, now)
         (end,) = self.ends
         assert end.code in (1, 2)
         assert not self.is_held
-        assert self.look(now + 50.0) == []
+        assert self.run_timer(now + 50.0) == []
         return end.text
 
 
@@ -113,15 +113,15 @@ def reach(wanted: Call | None = None, scene: Scene | None = None) -> Scene:
     scene = scene or known()
     scene.device(DISABLED)
     for call in PREPARATION:
-        assert scene.look() == [call]
-        assert scene.look() == [], "one call at a time"
+        assert scene.run_timer() == [call]
+        assert scene.run_timer() == [], "one call at a time"
         # The device accepts a press only after a release.
         assert scene.holds
         assert not scene.is_held
         if call == wanted:
             return scene
         scene.answer(call)
-    assert scene.look() == []
+    assert scene.run_timer() == []
     assert scene.is_held
     return scene
 
@@ -142,11 +142,11 @@ def test_a_whole_run_is_held_shown_released_and_disabled() -> None:
 def test_a_signal_releases_and_disables_before_the_end_and_a_second_one_ends_at_once() -> None:
     for is_mute in (False, True):
         scene = reach()
-        scene.take(scene.operator.on_stop(moment(2.0)))
+        scene.execute(scene.operator.on_stop(moment(2.0)))
         assert not scene.is_held
         assert (scene.calls, scene.ends) == ([DISABLE], [])
         if is_mute:
-            scene.take(scene.operator.on_stop(moment(2.1)))
+            scene.execute(scene.operator.on_stop(moment(2.1)))
         else:
             scene.answer(DISABLE, 2.1)
         assert scene.ends == [Exit(130, "interrupted")]
@@ -157,17 +157,17 @@ def test_it_waits_until_the_recorder_has_all_parameters() -> None:
     scene.device(DISABLED)
     for recorded, calls in ((f"/{NAME}", []), (f"/{NAME}, {RIG}", [CONFIRM])):
         status = m.Status("/recorder", "parameters_of", Level.OK, recorded)
-        scene.take(scene.rows["/diagnostics"](m.Diagnostics(1, (status,)), moment(1.0)))
-        assert scene.look() == calls
+        scene.execute(scene.rows["/diagnostics"](m.Diagnostics(1, (status,)), moment(1.0)))
+        assert scene.run_timer() == calls
 
 
 def test_it_calls_nothing_while_a_partner_is_missing() -> None:
     scene = known()
     scene.discover((RIG,), missing="device/home")
     scene.device(FRESH)
-    assert scene.look(89.9) == []
+    assert scene.run_timer(89.9) == []
     assert scene.ends == []
-    assert scene.look(90.0) == []
+    assert scene.run_timer(90.0) == []
     assert scene.ends == [
         Exit(2, "the rig is not ready after 90 s: missing service device/home"),
     ]
@@ -177,11 +177,11 @@ def test_it_repeats_calls_until_the_rig_is_ready_or_refuses() -> None:
     scene = reach(CONFIRM)
     not_yet = "waiting for a subscriber of joint_states"
     scene.answer(CONFIRM, 1.0, not_yet, success=False)
-    assert scene.look(1.05) == []
+    assert scene.run_timer(1.05) == []
     for now, refusal in ((20.0, not_yet), (20.2, "the needle is in"), (22.2, "the needle is in")):
         # The cause of a refusal may have changed meanwhile.
         assert scene.ends == []
-        assert scene.look(now) == [CONFIRM]
+        assert scene.run_timer(now) == [CONFIRM]
         scene.answer(CONFIRM, now, refusal, success=False)
     assert scene.ends == [Exit(2, "device/confirm_needle_out was refused: the needle is in")]
 
@@ -193,53 +193,53 @@ def test_a_service_that_never_answers_is_named() -> None:
 def test_a_call_is_repeated_if_its_answer_is_lost() -> None:
     for call, following in itertools.zip_longest(PREPARATION, PREPARATION[1:]):
         scene = reach(call)
-        assert scene.look(0.9 + CALL_TIMEOUT) == []
-        assert scene.look(1.0 + CALL_TIMEOUT) == [call]
+        assert scene.run_timer(0.9 + CALL_TIMEOUT) == []
+        assert scene.run_timer(1.0 + CALL_TIMEOUT) == [call]
         scene.answer(call, 2.1)
-        assert scene.look(2.1) == ([] if following is None else [following])
+        assert scene.run_timer(2.1) == ([] if following is None else [following])
         assert scene.is_held is (following is None)
         # Answers to the earlier attempt change nothing.
         for success in (True, False):
             scene.answer(call, 2.2, "the device is MOVING", success=success)
-            assert scene.look(2.5) == []
+            assert scene.run_timer(2.5) == []
             assert scene.is_held is (following is None)
 
 
 def test_an_earlier_status_does_not_end_the_homing() -> None:
     scene = reach(HOME)
     scene.answer(HOME, 1.0, "homing")
-    assert scene.look() == []
+    assert scene.run_timer() == []
     # A device may still report homed from last time while it searches for its switches.
     for homed in (False, True):
         scene.device(MOVING, 2.0, homed=homed)
-        assert scene.look(2.0) == []
+        assert scene.run_timer(2.0) == []
     scene.device(DISABLED, 3.0)
-    assert scene.look(3.0) == [ENABLE]
+    assert scene.run_timer(3.0) == [ENABLE]
 
 
 def test_a_status_may_replace_the_answer_of_homing() -> None:
     overtaken, lost, stale = reach(HOME), reach(HOME), reach(HOME)
     overtaken.device(DISABLED)
     overtaken.answer(HOME, 1.0, "homing")
-    assert overtaken.look() == [ENABLE]
+    assert overtaken.run_timer() == [ENABLE]
     lost.device(MOVING, 1.2)
-    assert lost.look(5.0) == [], "it moves: not asked again"
+    assert lost.run_timer(5.0) == [], "it moves: no repeated call"
     lost.device(DISABLED, 9.0)
-    assert lost.look(9.0) == [ENABLE]
+    assert lost.run_timer(9.0) == [ENABLE]
     # A homed status from before the call does not replace the answer.
     stale.device(DISABLED, 1.1, needle_out_confirmed=True)
-    assert stale.look(1.2) == []
-    assert stale.look(1.0 + CALL_TIMEOUT) == [HOME]
+    assert stale.run_timer(1.2) == []
+    assert stale.run_timer(1.0 + CALL_TIMEOUT) == [HOME]
 
 
 def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
     scene = reach(START)
     for now, changes in ((1.1, {"starts": 0, "state": "IDLE"}), (1.2, {})):
         scene.controller(now, **changes)
-        assert scene.look(now) == []
+        assert scene.run_timer(now) == []
         assert scene.is_held == (not changes)
     scene.answer(START, 1.3, "already steering", success=False)
-    assert scene.look(9.0) == []
+    assert scene.run_timer(9.0) == []
     assert scene.is_held
 
 
@@ -248,12 +248,12 @@ def test_start_requires_a_controller_status() -> None:
         scene = Scene()
         scene.device(DISABLED)
         for call in PREPARATION[:-1]:
-            assert scene.look() == [call]
+            assert scene.run_timer() == [call]
             scene.answer(call)
-        assert scene.look() == []
+        assert scene.run_timer() == []
         if is_known:
             scene.controller(1.1, state="DONE", starts=4)
-            assert scene.look(1.1) == [START]
+            assert scene.run_timer(1.1) == [START]
             scene.answer(START, 1.1)
             assert scene.ends == []
         else:
@@ -279,7 +279,7 @@ def test_statuses_before_the_start_are_ignored() -> None:
         reach(None, scene)
         scene.controller(2.0, state=state)
         scene.controller(2.0, starts=2)
-        assert scene.look(2.0) == []
+        assert scene.run_timer(2.0) == []
         assert scene.is_held
         scene.controller(3.0, state="DONE", starts=2)
         scene.answer(DISABLE, 3.0)
@@ -304,7 +304,7 @@ def test_no_progress_releases_the_hold() -> None:
     scene = reach()
     scene.controller(10.0)
     scene.controller(30.0)
-    assert scene.look(39.9) == []
+    assert scene.run_timer(39.9) == []
     assert scene.is_held
     assert "no progress for 30 s at 3.0 mm" in scene.failure(40.0)
 
@@ -314,11 +314,11 @@ def test_an_ignored_press_is_released_and_repeated() -> None:
         scene = reach()
         if counted_before:
             scene.device(HOLDING, 1.1, hold_owner=NAME)
-        # The device has heard the release in between. On a busy machine statuses arrive late: a
+        # The device has received the release in between. On a busy machine statuses arrive late: a
         # step may be under way without one.
         for now, again in ((9.0, NAME), (9.1, ""), (9.2, "somebody"), (30.0, "")):
             scene.device(HOLDING, now, press_again=again)
-            assert scene.look(now) == []
+            assert scene.run_timer(now) == []
             assert scene.is_held is (again != NAME)
 
 
@@ -330,16 +330,16 @@ def test_a_real_device_ends_the_run() -> None:
     scene = known()
     scene.device(DISABLED, simulated=False)
     assert [end.code for end in scene.ends] == [2]
-    assert (scene.look(), scene.holds) == ([], [])
+    assert (scene.run_timer(), scene.holds) == ([], [])
 
 
 def test_it_acts_only_on_a_single_simulated_device() -> None:
     scene = Scene((DRIVER,))
-    assert scene.look() == [], "nothing is known of it yet"
+    assert scene.run_timer() == [], "nothing is known of it yet"
     scene.device(FRESH)
-    assert scene.look() == [], "another said that"
+    assert scene.run_timer() == [], "reported by another device"
     scene.discover((RIG, DRIVER))
-    assert scene.look() == []
+    assert scene.run_timer() == []
     assert scene.ends == [], "one that was killed counts for a while"
     assert f"received it from {RIG}, {DRIVER}" in scene.failure(90.0)
     assert scene.holds == []
@@ -349,7 +349,7 @@ def test_a_second_device_ends_the_run() -> None:
     scene = reach()
     before = len(scene.holds)
     scene.discover((DRIVER,))
-    assert scene.look(1.1) == []
+    assert scene.run_timer(1.1) == []
     assert len(scene.holds) == before, "it has not said what it is"
     scene.discover((DRIVER, RIG))
     assert f"more than one device: {DRIVER}, {RIG}" in scene.failure()

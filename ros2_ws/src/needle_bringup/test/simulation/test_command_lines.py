@@ -68,10 +68,10 @@ class Other:
 
 def test_invalid_options_are_named_in_one_line() -> None:
     for understand, table in ((parse, REFUSED), (parse_console, REFUSED_BY_CONSOLE)):
-        for words, named in table:
+        for command_line, named in table:
             with pytest.raises(UserError) as caught:
-                understand(words.split())
-            assert named in str(caught.value), words
+                understand(command_line.split())
+            assert named in str(caught.value), command_line
             assert len(str(caught.value).splitlines()) == 1
 
 
@@ -89,10 +89,10 @@ def test_the_defaults_are_the_designed_ones() -> None:
 
 def test_positions_may_start_with_a_minus_and_a_target_allows_the_full_depth() -> None:
     assert parse(["--initial", "-5,4,15"]).initial_x_mm == -5.0
-    for words in (["--target", "-8,5,90"], ["--target=-8,5,90"]):
-        options = parse(words)
+    for argv in (["--target", "-8,5,90"], ["--target=-8,5,90"]):
+        options = parse(argv)
         assert (options.target_mm, options.depth_mm) == ((-8.0, 5.0, 90.0), 150.0)
-        assert parse([*words, "--depth-mm", "100"]).depth_mm == 100.0
+        assert parse([*argv, "--depth-mm", "100"]).depth_mm == 100.0
 
 
 def test_the_recorded_command_repeats_the_run(
@@ -110,17 +110,17 @@ def test_the_recorded_command_repeats_the_run(
         "--component my_probe:Probe --component other:One",
     ):
         options = parse(shlex.split(line))
-        program, *words = shlex.split(command_of(options))
+        program, *argv = shlex.split(command_of(options))
         assert program == "scripts/simulate"
-        assert parse(words) == dataclasses.replace(options, bag=None, json=None), line
+        assert parse(argv) == dataclasses.replace(options, bag=None, json=None), line
 
 
 def test_the_console_has_the_rig_of_simulate_with_continuous_insertion() -> None:
-    words = "--level tip --initial -5,1,0 --noise-mm 0.5"
-    rig = parse_console(words.split()).rig
-    assert rig == parse([*words.split(), "--insertion=continuous", "--real-time-factor=1"])
+    command_line = "--level tip --initial -5,1,0 --noise-mm 0.5"
+    rig = parse_console(command_line.split()).rig
+    assert rig == parse([*command_line.split(), "--insertion=continuous", "--real-time-factor=1"])
     assert parse_console(["--insertion=stepwise"]).rig.insertion == "stepwise"
-    plain, graph = (rig_parameters(parse_console(words)) for words in ([], ["--graph"]))
+    plain, graph = (rig_parameters(parse_console(argv)) for argv in ([], ["--graph"]))
     assert plain["sim_rig"]["camera_rate"] == 10.0
     for name in ("sim_rig", "stereo_tracker", "plane_controller"):
         assert graph[name] == plain[name]

@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from needle_bringup.simulation.launch_nodes import (
-    nodes_beside_rig,
+    nodes_alongside_rig,
     refuse_misspelt,
-    replay_words,
+    replay_arguments,
     replayed_nodes,
     simulated_nodes,
 )
@@ -26,10 +26,10 @@ def simulated(**arguments: str) -> Parameters:
     return simulated_nodes({**default, **arguments})
 
 
-def beside_rig(**arguments: str) -> Parameters:
+def alongside_rig(**arguments: str) -> Parameters:
     calibration = str(find_shared_file("needle_tracker", "config/calibration.yaml"))
     default = dict.fromkeys(("registration", "drives", "bag", "params"), "")
-    return nodes_beside_rig({**default, "calibration": calibration, **arguments})
+    return nodes_alongside_rig({**default, "calibration": calibration, **arguments})
 
 
 def file_of(folder: Path, node: str, **values: Any) -> str:
@@ -44,16 +44,20 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
     emulator = file_of(tmp_path, "drive_emulator", channel="x")
     operator = file_of(tmp_path, "simulated_operator", wait_for_recorder=True)
     for start, arguments, cause in (
-        (beside_rig, {"drives": typo}, "drives:=.*typo.yaml: no such file"),
-        (beside_rig, {"params": typo}, "params:=.*typo.yaml: no such file"),
+        (alongside_rig, {"drives": typo}, "drives:=.*typo.yaml: no such file"),
+        (alongside_rig, {"params": typo}, "params:=.*typo.yaml: no such file"),
         (simulated, {"params": typo}, "params:=.*typo.yaml: no such file"),
-        (beside_rig, {"calibration": bag}, "calibration:=.*: a folder, not a file"),
-        (beside_rig, {"registration": typo}, "registration:=.*typo.yaml: no such file"),
-        (beside_rig, {"bag": bag}, "already contains a bag"),
+        (alongside_rig, {"calibration": bag}, "calibration:=.*: a folder, not a file"),
+        (alongside_rig, {"registration": typo}, "registration:=.*typo.yaml: no such file"),
+        (alongside_rig, {"bag": bag}, "already contains a bag"),
         (simulated, {"bag": bag}, "already contains a bag"),
         (simulated, {"seed": "-1"}, "--seed = -1"),
         # A driver without configuration would run on its defaults.
-        (beside_rig, {"drives": emulator}, "'drive_emulator' is not started here, only device_d"),
+        (
+            alongside_rig,
+            {"drives": emulator},
+            "'drive_emulator' is not started here, only device_d",
+        ),
         (simulated, {"params": operator}, "'simulated_operator' is not started here, only sim_rig"),
         (
             simulated,
@@ -66,24 +70,24 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
 
 
 def test_a_rig_has_the_nodes_of_its_files(tmp_path: Path) -> None:
-    plain = beside_rig()
+    plain = alongside_rig()
     assert set(plain) == {"stereo_tracker", "plane_controller"}
     # Best-effort images are received.
     assert plain["stereo_tracker"]["reliable_images"] is False
     registration = file_of(tmp_path, "registration")
-    tracked = beside_rig(registration=registration)
+    tracked = alongside_rig(registration=registration)
     assert tracked == {"plane_controller": {}, "tracked_tip": {"registration_file": registration}}
     drives = file_of(tmp_path, "device_driver", channel="can7")
-    assert beside_rig(drives=drives)["device_driver"] == {"channel": "can7"}
+    assert alongside_rig(drives=drives)["device_driver"] == {"channel": "can7"}
     depth = file_of(tmp_path, "plane_controller", depth=0.05)
-    assert beside_rig(params=depth)["plane_controller"] == {"depth": 0.05}
+    assert alongside_rig(params=depth)["plane_controller"] == {"depth": 0.05}
     assert simulated(params=depth)["plane_controller"]["depth"] == 0.05
     with pytest.raises(UserError, match="this node is /rig1/device_driver: write '/rig1/device_d"):
-        beside_rig(drives=drives, namespace="rig1")
+        alongside_rig(drives=drives, namespace="rig1")
 
 
 def test_a_bag_contains_its_launch_arguments(tmp_path: Path) -> None:
-    for start in (beside_rig, simulated):
+    for start in (alongside_rig, simulated):
         recorder = start(bag=str(tmp_path / "bag"))["recorder"]
         assert recorder["bag"] == str(tmp_path / "bag")
         assert recorder["run_info"]
@@ -106,7 +110,7 @@ def test_a_file_of_two_rigs_has_both_namespaces(tmp_path: Path) -> None:
     depths = {f"/rig{n}/plane_controller": {"ros__parameters": {"depth": 0.01 * n}} for n in (1, 2)}
     file = tmp_path / "two.yaml"
     file.write_text(yaml.safe_dump(depths))
-    for start in (beside_rig, simulated):
+    for start in (alongside_rig, simulated):
         for namespace in ("rig2", "/rig2/"):
             given = start(params=str(file), namespace=namespace)
             assert given["plane_controller"]["depth"] == 0.02
@@ -121,10 +125,10 @@ def test_an_existing_bag_is_played_for_viewers(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").touch()
     arguments = {"bag": str(tmp_path), "rate": "0.5", "start": "2.0", "loop": "true"}
     assert replayed_nodes(arguments) == {"player": {}, "live_view": {}}
-    words = replay_words({**arguments, "namespace": "/first"})
-    assert words["player"] == [str(tmp_path), "--rate", "0.5", "--start", "2.0", "--loop"]
+    by_node = replay_arguments({**arguments, "namespace": "/first"})
+    assert by_node["player"] == [str(tmp_path), "--rate", "0.5", "--start", "2.0", "--loop"]
     # Topics that control a rig are played only under /replay.
-    assert "target_plane:=/replay/first/target_plane" in words["live_view"]
+    assert "target_plane:=/replay/first/target_plane" in by_node["live_view"]
 
 
 def test_a_misspelt_argument_is_named() -> None:

@@ -131,8 +131,8 @@ class Graph:
 
     def run(self) -> int:
         with mock.patch.dict(os.environ):
-            words = ["--level", "drive", "--graph", "--bag", str(self.bag)]
-            return simulate.simulate(parse(words))
+            argv = ["--level", "drive", "--graph", "--bag", str(self.bag)]
+            return simulate.simulate(parse(argv))
 
 
 @pytest.fixture

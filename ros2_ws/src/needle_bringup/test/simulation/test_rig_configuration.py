@@ -45,8 +45,8 @@ CLASSES: dict[str, type[Any]] = {
 }
 
 
-def nodes_for(words: str = "") -> Parameters:
-    return command_line_parameters(parse(words.split()), Path("bag"))
+def nodes_for(command_line: str = "") -> Parameters:
+    return command_line_parameters(parse(command_line.split()), Path("bag"))
 
 
 def test_the_command_line_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
@@ -93,7 +93,7 @@ def test_only_the_nodes_of_the_level_run() -> None:
     assert set(PACKAGES) <= set(parameter_files.NODES)
 
 
-def test_the_controller_knows_the_sensor_of_its_level() -> None:
+def test_the_controller_is_configured_for_the_sensor_of_its_level() -> None:
     tip = nodes_for("--level tip --noise-mm 0.5")["plane_controller"]
     assert (tip["tip_covariance"], tip["tip_noise"]) == ("configured", "bounded")
     assert tip["tip_noise_bound"] == pytest.approx(0.0005)
@@ -104,7 +104,7 @@ def test_the_controller_knows_the_sensor_of_its_level() -> None:
 
 def test_the_launched_rig_is_that_of_simulate() -> None:
     # Beyond the defaults, simulate sets only what the command line gives, recording, and the
-    # emulated adapter: nothing of it describes the rig.
+    # emulated adapter: none of these describe the rig.
     of_run = {"level", "seed", "preset"}
     of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
     set_by_simulate = {

@@ -87,12 +87,12 @@ def test_invalid_input_ends_with_one_line(
     urdf: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     urdf.write_text("no")
-    for words, cause in (
+    for argv, cause in (
         (["--check", str(urdf)], "not a URDF: "),
         (["--check", str(tmp_path / "none")], "none: no such file"),
         (["--calibration", str(urdf), str(urdf)], "calibration"),
         ([str(tmp_path / "no" / "rig.urdf")], "its folder must exist"),
     ):
-        assert main(words) == 2
+        assert main(argv) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert cause in line

@@ -30,9 +30,9 @@ KEYS = {
 }
 
 
-def record(folder: Path, *words: str, check: Callable[[], None] = lambda: None) -> bytes:
+def record(folder: Path, *argv: str, check: Callable[[], None] = lambda: None) -> bytes:
     """Record a run as `simulate` does; return its MCAP file."""
-    options = parse(words)
+    options = parse(argv)
     rig = make_components(command_line_parameters(options, folder))
     information = run_info(options)
     run_virtually(
@@ -46,8 +46,8 @@ def record(folder: Path, *words: str, check: Callable[[], None] = lambda: None) 
 def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, Path]:
     """Return the exit code of a whole run, and its folder."""
     folder = tmp_path_factory.mktemp("ended")
-    words = [*WORDS, "--bag", str(folder / "bag"), "--json", str(folder / "result.json")]
-    return simulate.main(words), folder
+    argv = [*WORDS, "--bag", str(folder / "bag"), "--json", str(folder / "result.json")]
+    return simulate.main(argv), folder
 
 
 def test_a_run_leaves_bag_report_and_summary(ended: tuple[int, Path]) -> None:
@@ -72,9 +72,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]
     folder, drive = tmp_path_factory.mktemp("recorded"), ("--level", "drive", "--depth-mm", "1")
     kinds = {"tip": WORDS, "drive": drive, "continuous": (*WORDS, "--insertion", "continuous")}
     runs = {}
-    for kind, words in kinds.items():
+    for kind, argv in kinds.items():
         seeds = enumerate(("1", "1", "2"))
-        runs[kind] = [record(folder / f"{kind}_{n}", *words, "--seed", s) for n, s in seeds]
+        runs[kind] = [record(folder / f"{kind}_{n}", *argv, "--seed", s) for n, s in seeds]
         assert rerun.main([str(folder / f"{kind}_0")]) == 0
     return runs
 
@@ -148,7 +148,7 @@ def test_an_unfinished_run_names_its_first_cause(stopped: Run) -> None:
     assert lines[0].startswith("NOT FINISHED: ")
     assert lines[0].endswith("but stopped at 30 mm: no tip for 2 s.")
     *before, waits, ends = stopped.controller_status
-    # A tip that was found again is no cause; an earlier report of device or simulation is one.
+    # A lost and found tip is not a cause; an earlier report of device or simulation is.
     again = dataclasses.replace(before[-1], log_time=waits.log_time + 5)
     run = dataclasses.replace(stopped, controller_status=[*before, waits, again, ends])
     assert stop_cause(run) == "device is off"

@@ -128,9 +128,9 @@ def lossy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, str]:
     """Return a rig whose tracker missed some images, and the output of its rerun."""
     folder = tmp_path_factory.mktemp("lossy")
     bag, images = folder / "bag", str(folder / "images")
-    words = ("--level", "camera", "--depth-mm", "3")
+    argv = ("--level", "camera", "--depth-mm", "3")
     lost = (drop("stereo/left/image_raw", 0.4),)
-    rig = Rig(*words, faults=lost, bag=bag, images=images, scenario="clutter")
+    rig = Rig(*argv, faults=lost, bag=bag, images=images, scenario="clutter")
     assert rig.until_end() == 0
     assert rig.tap is not None
     rig.tap.close()
@@ -143,7 +143,7 @@ def test_pairs_are_exposed_only_when_a_tip_is_expected(lossy: tuple[Rig, str]) -
     rig, _ = lossy
     assert rig.depth == pytest.approx(0.003, abs=1e-5)
     pairs, tips = len(rig.sent["stereo/left/image_raw"]), len(rig.sent["needle/tip_pose"])
-    # One at each depth, and another a second later if no tip came.
+    # One at each depth, and another a second later if there was no tip.
     assert 4 == tips < pairs < 12
 
 
@@ -187,8 +187,8 @@ def late(latest: float) -> Fault:
 def late_bag(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
     """Return the bag of a run whose controller received messages late and was frozen once."""
     bag = tmp_path_factory.mktemp("late") / "bag"
-    words = ("--level", "tip", "--depth-mm", "2", "--insertion", request.param)
-    rig = Rig(*words, faults=(late(0.04),), bag=bag)
+    argv = ("--level", "tip", "--depth-mm", "2", "--insertion", request.param)
+    rig = Rig(*argv, faults=(late(0.04),), bag=bag)
     rig.until_depth(0.001)
     rig.runner.freeze("plane_controller", 0.2)
     assert rig.until_end() == 0

@@ -112,9 +112,9 @@ def test_a_worker_with_different_code_is_rejected(
         list(on_cluster(ADDRESS, square, [1]))
 
 
-def figures_of(folder: Path, *words: str) -> tuple[Mapping[str, object], str]:
+def figures_of(folder: Path, *argv: str) -> tuple[Mapping[str, object], str]:
     study = ["--targets", "3", "--depth-mm", "2", "--json", str(folder / "f.json")]
-    assert main([*study, "--csv", str(folder / "f.csv"), *words]) == 0
+    assert main([*study, "--csv", str(folder / "f.csv"), *argv]) == 0
     figures = json.loads((folder / "f.json").read_text("utf-8"))
     for key in ("wall_s", "cpu_s"):
         assert figures.pop(key) > 0.0

@@ -71,17 +71,17 @@ REFUSED = (
 )
 
 
-def study(folder: Path, words: str) -> tuple[dict[str, Any], list[dict[str, str]]]:
+def study(folder: Path, command_line: str) -> tuple[dict[str, Any], list[dict[str, str]]]:
     """Run a study; return its figures and its runs."""
     files = ["--json", str(folder / "f.json"), "--csv", str(folder / "f.csv")]
-    assert main([*words.split(), *files]) == 0
+    assert main([*command_line.split(), *files]) == 0
     with (folder / "f.csv").open(encoding="utf-8") as stream:
         return json.loads((folder / "f.json").read_text("utf-8")), list(csv.DictReader(stream))
 
 
 def test_the_known_result_of_open_loop_is_in_json_and_csv(tmp_path: Path) -> None:
-    words = "--controller open_loop --initial -3,2,15 --draws 1 --slip 0.0 --seed 5"
-    figures, rows = study(tmp_path, words)
+    command_line = "--controller open_loop --initial -3,2,15 --draws 1 --slip 0.0 --seed 5"
+    figures, rows = study(tmp_path, command_line)
     assert set(figures) >= KEYS
     assert (figures["runs"], figures["converged_at_end"]) == (1000, 0.0)
     assert figures["final_max_mm"] == pytest.approx(14.62, abs=0.005)
@@ -98,8 +98,8 @@ def test_the_known_result_of_open_loop_is_in_json_and_csv(tmp_path: Path) -> Non
 
 
 def test_the_same_seed_gives_the_same_figures(tmp_path: Path) -> None:
-    words = "--controller paper --draws 1 --depth-mm 25 --seed "
-    one, again, other = (study(tmp_path, words + seed)[0] for seed in ("1", "1", "2"))
+    command_line = "--controller paper --draws 1 --depth-mm 25 --seed "
+    one, again, other = (study(tmp_path, command_line + seed)[0] for seed in ("1", "1", "2"))
     assert one["rms_last_20_mm"] == again["rms_last_20_mm"] != other["rms_last_20_mm"]
 
 
@@ -119,8 +119,8 @@ def test_targets_have_figures_of_points_and_none_of_the_plane(tmp_path: Path, la
 
 
 def test_bad_arguments_give_a_one_line_error_and_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, cause in REFUSED:
-        assert main(words.split()) == 2, words
+    for command_line, cause in REFUSED:
+        assert main(command_line.split()) == 2, command_line
         captured = capsys.readouterr()
         assert captured.out == ""
         assert len(captured.err.strip().splitlines()) == 1

@@ -1,4 +1,4 @@
-"""Drawn training samples: they show what was requested."""
+"""Drawn training samples match the request."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_patches_have_needles_backgrounds_and_ends_or_none() -> None:
     samples = [patch(np.random.default_rng([3, n])) for n in range(7)]
     for sample in samples:
         assert sample.image.shape == sample.share.shape == (CANVAS, CANVAS)
-        # No end without a shaft; but the end of a shaft may be outside.
+        # Without a shaft there is no end; a shaft may end outside the patch.
         assert np.isnan(sample.end).all() or sample.share.any() or sample.end.min() < 0.0
         if sample.share.any():
             assert np.isfinite(sample.end).all()

@@ -50,7 +50,7 @@ def test_a_patch_at_the_border_is_whole(place: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize("width_px", [4.0, 10.0])
-def test_a_sample_and_its_labels_are_rotated_and_scaled_alike(width_px: float) -> None:
+def test_a_sample_and_its_labels_are_rotated_and_scaled_together(width_px: float) -> None:
     with_needle = ends = 0
     scene = bars(width_px)
     for seed in range(40):
@@ -66,7 +66,7 @@ def test_a_sample_and_its_labels_are_rotated_and_scaled_alike(width_px: float) -
             ends += 1
             column, row = np.rint(sample.end).astype(int)
             around = share[row - 6 : row + 7, column - 6 : column + 7]
-            # A shaft that ends there fills less than half of what is around.
+            # A shaft that ends there fills less than half of the surroundings.
             assert 0.02 < around.mean() < 0.62
     assert with_needle > 10
     assert ends > 5

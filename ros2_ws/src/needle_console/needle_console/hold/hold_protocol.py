@@ -51,7 +51,7 @@ class HoldProtocol:
 
     Parameters
     ----------
-    why_not : callable
+    refusal_reason : callable
         Returns the reason why a page may only watch, empty if it may hold; its argument is whether
         the page is shown on the rig's own machine.
     on_state : callable
@@ -64,12 +64,12 @@ class HoldProtocol:
 
     def __init__(
         self,
-        why_not: Callable[[bool], str],
+        refusal_reason: Callable[[bool], str],
         on_state: Callable[[PageHold], None],
         on_notice: Callable[[str], None],
         now: float,
     ) -> None:
-        self._why_not = why_not
+        self._refusal_reason = refusal_reason
         self._on_state = on_state
         self._on_notice = on_notice
         # All keys are set from the start, because another thread may read it.
@@ -181,7 +181,7 @@ class HoldProtocol:
 
     def _watch_only_reason(self, page: int, now: float) -> str:
         """Return the reason why a page may only watch and stop; empty if it may hold."""
-        if why := self._why_not(self._pages[page].is_local):
+        if why := self._refusal_reason(self._pages[page].is_local):
             return why
         is_free = self._owner in (None, page) or now - self._held_at > IDLE
         return "" if is_free else OTHER_PAGE

@@ -32,7 +32,7 @@ class HoldServer:
         Checks the connections.
     port : int
         Port to listen on; 0 selects a free one.
-    why_not, on_state, on_notice : callable
+    refusal_reason, on_state, on_notice : callable
         As for `HoldProtocol`; the hold's thread calls them, so they must not block.
 
     Raises
@@ -45,12 +45,12 @@ class HoldServer:
         self,
         access: Access,
         port: int,
-        why_not: Callable[[bool], str],
+        refusal_reason: Callable[[bool], str],
         on_state: Callable[[PageHold], None],
         on_notice: Callable[[str], None],
     ) -> None:
         self._access = access
-        self._protocol = HoldProtocol(why_not, on_state, on_notice, time.monotonic())
+        self._protocol = HoldProtocol(refusal_reason, on_state, on_notice, time.monotonic())
         self._socket = listening_socket(access.address, port)
         self._loop = asyncio.new_event_loop()
         self._woken = asyncio.Event()

@@ -76,7 +76,7 @@ class PagePort:
     def close(self) -> None:
         """Do nothing: this port has no threads."""
 
-    def _take(self) -> tuple[PageEvent, ...]:
+    def _pop_events(self) -> tuple[PageEvent, ...]:
         """Return the events since the last call.
 
         The newest hold counts, unless one of them was a release; the next one follows soon. The age
@@ -103,7 +103,7 @@ class PagePort:
         with self._lock:
             self._hold, self._hold_at = hold, self._clock()
             self._was_released |= not hold.pressed
-        self._arrive(self._take)
+        self._arrive(self._pop_events)
 
     def hold_refusal(self, is_local: bool) -> str:
         """Return the reason why a page, `is_local` or remote, may only watch and stop, if any."""
@@ -143,7 +143,7 @@ class PagePort:
     def _add(self, event: PageEvent) -> None:
         with self._lock:
             self._events.append(event)
-        self._arrive(self._take)
+        self._arrive(self._pop_events)
 
 
 def _vector(values: Array) -> tuple[float, float, float]:

@@ -25,14 +25,14 @@ def page(scene: Scene) -> int:
 
 
 def test_press_after_a_release_counts(scene: Scene, page: int) -> None:
-    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
+    assert scene.send(page, True) is HoldRefusal.NEW_PRESS
     assert scene.protocol.state(scene.now) == RELEASED
-    assert scene.say(page, False) is None
-    assert scene.say(page, True, speed=0.25, mode="retract") is None
+    assert scene.send(page, False) is None
+    assert scene.send(page, True, speed=0.25, mode="retract") is None
     assert scene.protocol.state(scene.now) == PageHold(True, 0.25, Mode.RETRACT)
-    assert scene.say(page, True, speed=0.75, mode="retract") is None
+    assert scene.send(page, True, speed=0.75, mode="retract") is None
     assert scene.protocol.state(scene.now).speed == 0.75
-    assert scene.say(page, False) is None
+    assert scene.send(page, False) is None
     assert scene.protocol.state(scene.now) == RELEASED
 
 
@@ -43,12 +43,12 @@ def test_hold_lasts_while_echoed_and_ends_with_silence(scene: Scene, page: int) 
     for _ in range(20):
         scene.wait(ECHO_AGE_LIMIT - JUST)
         assert scene.pressed
-        assert scene.say(page, True) is None
+        assert scene.send(page, True) is None
     scene.wait(ECHO_AGE_LIMIT + JUST)
     assert not scene.pressed
     # A continued press does not count, and the first reason stays.
     for _ in range(10):
-        assert scene.say(page, True) is HoldRefusal.NEW_PRESS
+        assert scene.send(page, True) is HoldRefusal.NEW_PRESS
         assert not scene.pressed
         assert scene.message_to(page)["why"] == STALLED
         scene.wait(PERIOD)
@@ -59,13 +59,13 @@ def test_hold_lasts_while_echoed_and_ends_with_silence(scene: Scene, page: int) 
 
 def test_hold_age_counts_from_the_sent_count(scene: Scene, page: int) -> None:
     scene.press(page)
-    begin, held_up = scene.now, []
+    begin, delayed = scene.now, []
     while scene.now + PERIOD < begin + ECHO_AGE_LIMIT:
         scene.wait(PERIOD)
-        held_up.append((scene.message(page, True), scene.now))
-    for data, _ in held_up:
+        delayed.append((scene.message(page, True), scene.now))
+    for data, _ in delayed:
         assert scene.protocol.receive(page, data, scene.now) is None
-    _, last = held_up[-1]
+    _, last = delayed[-1]
     scene.wait(last + ECHO_AGE_LIMIT - JUST - scene.now)
     assert scene.pressed
     scene.wait(2.0 * JUST)
@@ -73,59 +73,59 @@ def test_hold_age_counts_from_the_sent_count(scene: Scene, page: int) -> None:
 
 
 @pytest.mark.parametrize("holds", [True, False])
-@pytest.mark.parametrize("held_up", [[True] * 12, [False, True]])
+@pytest.mark.parametrize("delayed", [[True] * 12, [False, True]])
 def test_burst_after_a_stall_does_not_count(
-    scene: Scene, page: int, held_up: list[bool], holds: bool
+    scene: Scene, page: int, delayed: list[bool], holds: bool
 ) -> None:
     if holds:
         scene.press(page)
     else:
-        scene.say(page, False)
-    messages = [scene.message(page, pressed) for pressed in held_up]
+        scene.send(page, False)
+    messages = [scene.message(page, pressed) for pressed in delayed]
     scene.wait(ECHO_AGE_LIMIT + JUST)
     for data in messages:
         assert scene.protocol.receive(page, data, scene.now) is HoldRefusal.STALE
         assert not scene.pressed
-    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
+    assert scene.send(page, True) is HoldRefusal.NEW_PRESS
     scene.press(page)
 
 
 def test_echo_counts_once_except_for_a_release(scene: Scene, page: int) -> None:
-    assert scene.say(page, False, count=1) is HoldRefusal.ECHO, "nothing was sent"
+    assert scene.send(page, False, count=1) is HoldRefusal.ECHO, "nothing was sent"
     scene.press(page)
     count = scene.count(page)
-    assert scene.say(page, True, count=count + 1) is HoldRefusal.ECHO
-    assert scene.say(page, True, count=count) is None
-    assert scene.say(page, True, count=count) is HoldRefusal.ECHO
-    assert scene.say(page, False, count=count) is None
+    assert scene.send(page, True, count=count + 1) is HoldRefusal.ECHO
+    assert scene.send(page, True, count=count) is None
+    assert scene.send(page, True, count=count) is HoldRefusal.ECHO
+    assert scene.send(page, False, count=count) is None
     assert not scene.pressed
-    assert scene.say(page, True, count=count) is HoldRefusal.ECHO
-    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
-    assert scene.say(page, False, count=count) is HoldRefusal.ECHO
+    assert scene.send(page, True, count=count) is HoldRefusal.ECHO
+    assert scene.send(page, True) is HoldRefusal.NEW_PRESS
+    assert scene.send(page, False, count=count) is HoldRefusal.ECHO
 
 
 def test_echo_of_another_connection_does_not_count(scene: Scene, page: int) -> None:
     other = scene.page()
-    scene.say(page, False)
+    scene.send(page, False)
     counts = [scene.count(which) for which in (page, other, page)]
     assert counts == sorted(set(counts))
-    assert scene.say(page, True, count=counts[1]) is HoldRefusal.ECHO
-    assert scene.say(page, False, count=counts[2]) is None
+    assert scene.send(page, True, count=counts[1]) is HoldRefusal.ECHO
+    assert scene.send(page, False, count=counts[2]) is None
     # A reconnected page has to release first.
     scene.protocol.close(page, scene.now)
     again = scene.page()
     before = scene.count(again)
-    assert scene.say(again, False, count=counts[2]) is HoldRefusal.ECHO
-    assert scene.say(again, True, count=before) is HoldRefusal.NEW_PRESS
+    assert scene.send(again, False, count=counts[2]) is HoldRefusal.ECHO
+    assert scene.send(again, True, count=before) is HoldRefusal.NEW_PRESS
 
 
 @pytest.mark.parametrize(
     ("act", "refusal"),
     [
-        (lambda scene, page: scene.say(page, False, count=10**6), HoldRefusal.ECHO),
-        (lambda scene, page: scene.say(page, True, mode="retract"), HoldRefusal.NEW_PRESS),
+        (lambda scene, page: scene.send(page, False, count=10**6), HoldRefusal.ECHO),
+        (lambda scene, page: scene.send(page, True, mode="retract"), HoldRefusal.NEW_PRESS),
         (lambda scene, page: scene.protocol.receive(page, "{}", scene.now), HoldRefusal.INVALID),
-        (lambda scene, page: scene.say(page, True, speed=float("nan")), HoldRefusal.INVALID),
+        (lambda scene, page: scene.send(page, True, speed=float("nan")), HoldRefusal.INVALID),
     ],
 )
 def test_invalid_message_ends_the_hold(
@@ -134,11 +134,11 @@ def test_invalid_message_ends_the_hold(
     scene.press(page)
     assert act(scene, page) is refusal
     assert not scene.pressed
-    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
+    assert scene.send(page, True) is HoldRefusal.NEW_PRESS
     # It also invalidates an earlier release.
-    scene.say(page, False)
+    scene.send(page, False)
     act(scene, page)
-    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
+    assert scene.send(page, True) is HoldRefusal.NEW_PRESS
     scene.press(page)
 
 
@@ -148,35 +148,35 @@ def test_barred_page_gets_the_reason(scene: Scene, is_local: bool) -> None:
     scene.bars[not is_local] = "of no concern"
     scene.press(page)
     scene.bars[is_local] = "watching only"
-    assert scene.say(page, True) is HoldRefusal.BARRED
+    assert scene.send(page, True) is HoldRefusal.BARRED
     assert not scene.pressed
     message = scene.message_to(page)
     assert (message["bar"], message["why"]) == ("watching only", "watching only")
     scene.bars[is_local] = ""
-    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
+    assert scene.send(page, True) is HoldRefusal.NEW_PRESS
     scene.press(page)
 
 
 def test_page_owns_the_hold_until_it_disconnects_or_idles(scene: Scene) -> None:
     first, second, third = scene.page(), scene.page(), scene.page()
     scene.press(first)
-    scene.say(first, False)
+    scene.send(first, False)
     assert scene.message_to(first)["bar"] == ""
-    scene.say(second, False)
-    assert scene.say(second, True) is HoldRefusal.BARRED
+    scene.send(second, False)
+    assert scene.send(second, True) is HoldRefusal.BARRED
     assert scene.message_to(second)["why"] == OTHER_PAGE
     scene.protocol.close(first, scene.now)
     # A continued press does not count.
-    assert scene.say(second, True) is HoldRefusal.NEW_PRESS
+    assert scene.send(second, True) is HoldRefusal.NEW_PRESS
     scene.press(second)
-    scene.say(second, False)
+    scene.send(second, False)
     scene.wait(IDLE)
     assert scene.message_to(third)["bar"] == OTHER_PAGE
     scene.wait(JUST)
     scene.press(third)
     assert scene.message_to(second)["bar"] == OTHER_PAGE
     # An earlier owner does not affect the hold; the owner ends it by disconnecting.
-    scene.say(second, False)
+    scene.send(second, False)
     scene.protocol.close(second, scene.now)
     assert scene.pressed
     scene.protocol.close(third, scene.now)
@@ -188,9 +188,9 @@ def test_owner_that_holds_is_not_idle(scene: Scene) -> None:
     scene.press(first)
     for _ in range(round(IDLE / 0.2) + 2):
         scene.wait(0.2)
-        assert scene.say(first, True) is None
-    scene.say(second, False)
-    assert scene.say(second, True) is HoldRefusal.BARRED
+        assert scene.send(first, True) is None
+    scene.send(second, False)
+    assert scene.send(second, True) is HoldRefusal.BARRED
     assert scene.pressed
 
 
@@ -199,5 +199,5 @@ def test_silent_page_is_lost(scene: Scene, page: int) -> None:
     assert not scene.protocol.is_silent(page, scene.now)
     scene.wait(JUST)
     assert scene.protocol.is_silent(page, scene.now)
-    scene.say(page, False)
+    scene.send(page, False)
     assert not scene.protocol.is_silent(page, scene.now)

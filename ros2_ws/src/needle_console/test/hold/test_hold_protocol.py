@@ -9,7 +9,7 @@ from needle_console.hold.hold_protocol import IDLE_PERIOD, PERIOD, SILENCE
 from needle_console.hold.page_session import ECHO_AGE_LIMIT, RELEASED
 
 
-def look_until(scene: Scene, end: float) -> None:
+def update_until(scene: Scene, end: float) -> None:
     """Update at the requested times."""
     while scene.now < end:
         scene.now = scene.protocol.update(scene.now)
@@ -22,7 +22,7 @@ def test_page_gets_the_reason_after_a_stall(first: str) -> None:
     scene.press(page)
     scene.wait(ECHO_AGE_LIMIT + 0.5)
     if first == "message":
-        scene.say(page, True)
+        scene.send(page, True)
     elif first == "look":
         scene.protocol.update(scene.now)
     message = scene.message_to(page)
@@ -36,7 +36,7 @@ def test_page_gets_the_reason_after_a_stall(first: str) -> None:
 def test_hold_is_reported_every_20_ms_or_80_ms_without_a_page() -> None:
     scene = Scene()
     begin = scene.now
-    look_until(scene, begin + 1.0)
+    update_until(scene, begin + 1.0)
     assert set(scene.reported) == {RELEASED}
     assert len(scene.reported) == pytest.approx(1.0 / IDLE_PERIOD, abs=1)
     # The first page shortens the period at once.
@@ -44,7 +44,7 @@ def test_hold_is_reported_every_20_ms_or_80_ms_without_a_page() -> None:
     scene.page()
     assert scene.protocol.update(begin) <= begin + PERIOD
     scene.reported.clear()
-    look_until(scene, begin + 1.0)
+    update_until(scene, begin + 1.0)
     assert len(scene.reported) == pytest.approx(1.0 / PERIOD, abs=1)
 
 
@@ -52,16 +52,16 @@ def test_changes_of_the_hold_are_reported_at_once() -> None:
     scene = Scene()
     page = scene.page()
     for end in ("silence", "close"):
-        look_until(scene, scene.now + 1.0)
+        update_until(scene, scene.now + 1.0)
         scene.press(page)
         begin = scene.now
         assert scene.reported[-1].pressed
         if end == "close":
             scene.protocol.close(page, begin)
         else:
-            look_until(scene, begin + ECHO_AGE_LIMIT)
+            update_until(scene, begin + ECHO_AGE_LIMIT)
             assert scene.reported[-1].pressed
-            look_until(scene, begin + ECHO_AGE_LIMIT + 1e-9)
+            update_until(scene, begin + ECHO_AGE_LIMIT + 1e-9)
             assert scene.now <= begin + ECHO_AGE_LIMIT + 1e-3
             scene.protocol.update(scene.now)
         assert scene.reported[-1] == RELEASED

@@ -34,10 +34,14 @@ class Rig:
         self.notices: list[str] = []
         self.asked: list[bool] = []
         self.server = HoldServer(
-            Access("127.0.0.1", 8080), 0, self.why_not, self.states.append, self.notices.append
+            Access("127.0.0.1", 8080),
+            0,
+            self.refusal_reason,
+            self.states.append,
+            self.notices.append,
         )
 
-    def why_not(self, is_local: bool) -> str:
+    def refusal_reason(self, is_local: bool) -> str:
         self.asked.append(is_local)
         return ""
 
@@ -111,6 +115,6 @@ def test_foreign_pages_are_refused_and_counted(rig: Rig) -> None:
     assert rig.notices == [f"hold: {kind}" for kind in counts]
 
 
-def test_taken_port_is_reported(rig: Rig) -> None:
+def test_a_port_in_use_is_reported(rig: Rig) -> None:
     with pytest.raises(UserError, match=rf"cannot listen on 127.0.0.1:{rig.server.port}: "):
         HoldServer(Access("127.0.0.1", 8080), rig.server.port, lambda _: "", print, print)

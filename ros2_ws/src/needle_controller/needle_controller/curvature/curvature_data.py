@@ -158,12 +158,12 @@ def read_bag(path: Path) -> InsertionRecord:
     tips: dict[int, list[float]] = {}
     joints: dict[int, list[float]] = {}
 
-    def is_wanted(topic: str) -> bool:
+    def is_selected(topic: str) -> bool:
         return ("/" + topic.lstrip("/")).endswith(("/needle/tip", "/joint_states"))
 
     with BagDirectory(path) as bag:
         store = bag.typestore()
-        for sent in bag.messages(is_wanted):
+        for sent in bag.messages(is_selected):
             message = bag.deserialize(store, sent)
             try:
                 if sent.topic.endswith("needle/tip"):

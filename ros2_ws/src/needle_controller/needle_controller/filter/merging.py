@@ -26,7 +26,7 @@ _NUMBERS = HYPOTHESIS.itemsize // 8
 @compiled
 def copy_hypothesis(source: Records, n: int, target: Records, m: int) -> None:
     """Copy hypothesis n of `source` to place m of `target`."""
-    # Number by number: the assignment of a whole record takes seconds to compile.
+    # Copy number by number: assigning a whole record takes seconds to compile.
     of, to = source.view(np.float64), target.view(np.float64)
     for k in range(_NUMBERS):
         to[m * _NUMBERS + k] = of[n * _NUMBERS + k]

@@ -23,7 +23,7 @@ from needle_controller.laws.point_turns import (
     desired_turn,
     insertion_to_closest_point,
     mean_slack,
-    write_need,
+    write_lateral_offset,
 )
 from needle_controller.laws.roll_law import allowed_turn, base_turn, hypotheses_of
 from needle_controller.model.arrays import Array
@@ -111,7 +111,7 @@ def point_turn(
         The settings.
     """
     ahead, need = _in_frame_of_tip(coordinates, target), np.empty(2)
-    arc_length = write_need(ahead, need)
+    arc_length = write_lateral_offset(ahead, need)
     left = insertion_to_closest_point(ahead, arc_length, curvature)
     if arc_length <= 0.0:
         return 0.0, left

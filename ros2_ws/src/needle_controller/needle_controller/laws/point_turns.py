@@ -70,11 +70,11 @@ class PointLawSettings(NamedTuple):
 
 
 @compiled
-def write_need(target: Array, need: Array) -> float:
+def write_lateral_offset(target: Array, need: Array) -> float:
     """Write the lateral offset that the arc to a target has to cover; return its length [m].
 
-    The arc may have any curvature. For a target beside or behind the tip the length is the distance
-    ahead, <= 0.
+    The arc may have any curvature. For a target next to or behind the tip, the length is the
+    distance ahead, <= 0.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def insertion_to_closest_point(target: Array, arc_length: float, curvature: floa
     target : ndarray, shape (3,)
         Target in the frame of the tip [m].
     arc_length : float
-        Length of the arc to it, see `write_need` [m].
+        Length of the arc to it, see `write_lateral_offset` [m].
     curvature : float
         Curvature of the needle's path [1/m].
     """
@@ -155,7 +155,7 @@ def desired_turn(
     Parameters
     ----------
     need : ndarray, shape (2,)
-        See `write_need` [m].
+        See `write_lateral_offset` [m].
     left : float
         Remaining insertion, > 0 [m].
     curvature : float
@@ -239,7 +239,7 @@ def rest_after(
     Parameters
     ----------
     need : ndarray, shape (2,)
-        See `write_need` [m].
+        See `write_lateral_offset` [m].
     left, curvature : float
         Remaining insertion [m], curvature of the needle's path [1/m].
     rate : float

@@ -183,7 +183,7 @@ def least_insertion_to_point(
 ) -> Array:
     """Return the least insertion from a tip to a point, shape (...) [m]; NaN if out of reach.
 
-    A point beside or behind the tip, or one for which the needle would have to turn by more than
+    A point next to or behind the tip, or one for which the needle would have to turn by more than
     `LARGEST_PITCH`, counts as out of reach. Parameters as for `point_reachability`.
     """
     target = np.asarray(target, dtype=float)

@@ -84,7 +84,7 @@ class TargetMotion:
             Observed positions [m].
         """
         if self._times and time <= self._times[-1]:
-            self.forget()
+            self.reset()
         # Limit the number of samples in the window by replacing the last one.
         spacing = WINDOW / _MOST_SAMPLES
         if len(self._times) > 1 and time - self._times[-2] < spacing:
@@ -95,7 +95,7 @@ class TargetMotion:
             del self._times[0], self._points[0]
         self._motion = None
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Discard all observations."""
         self._times.clear()
         self._points.clear()

@@ -221,7 +221,7 @@ def trace_leg(
 
 @compiled
 def _write_corner(point: Array, pose: Array, length: float) -> None:
-    # Number by number: the assignment of a slice takes seconds to compile.
+    # Copy number by number: assigning a slice takes seconds to compile.
     for i in range(3):
         point[i] = pose[i, 3]
     point[3] = length

@@ -62,7 +62,7 @@ def initial_legs(tip: Array, target: Array, number: int) -> tuple[Array, Array]:
     Returns
     -------
     legs : ndarray, shape (m + 1, 4)
-        Aim of each leg, and inf. The via points divide the straight line evenly and lie beside it
+        Aim of each leg, and inf. The via points divide the straight line evenly and lie off it
         [m].
     draws : ndarray, shape (generations, lambda, 3 m)
         See `optimize_legs`.

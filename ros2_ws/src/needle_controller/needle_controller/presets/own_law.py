@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.laws.law import SteeringCommand
-from needle_controller.laws.point_turns import write_need
+from needle_controller.laws.point_turns import write_lateral_offset
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.observers.estimator import Estimate, pose_estimate
 from needle_controller.presets.own_parts import OwnPart, own_part
@@ -49,7 +49,9 @@ class OwnLaw:
         """Return the command for the next step to a point; see `PointLaw`."""
         goal = np.array(target, dtype=float)
         rate = self._part.call("to_point", self._law.to_point, estimate, goal.copy())
-        arc_length = write_need((goal - estimate.position) @ estimate.rotation, np.empty(2))
+        arc_length = write_lateral_offset(
+            (goal - estimate.position) @ estimate.rotation, np.empty(2)
+        )
         return self._command("to_point()", rate, estimate, arc_length)
 
     def _command(

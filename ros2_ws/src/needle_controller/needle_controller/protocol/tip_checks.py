@@ -84,7 +84,7 @@ class TipCovariance:
         if self.frame_id != RIG:
             return f"needle/tip_pose in frame '{self.frame_id}', expected '{RIG}'"
         if np.any(np.isinf(self.matrix)):
-            return "needle/tip_pose says that no tip was found"
+            return "needle/tip_pose reports that no tip was found"
         if np.any(np.isnan(self.matrix)):
             return "covariance of needle/tip_pose is not a number"
         largest = float(np.max(np.abs(self.matrix)))
@@ -158,7 +158,7 @@ def check_message(tip: TipMeasurement, last: AcceptedTip | None) -> RejectedTip 
 def check_stamp(
     tip: TipMeasurement, oldest: JointSample | None, latest: JointSample | None
 ) -> RejectedTip | None:
-    """Check that the joint positions at a tip's exposure can be known; return the rejection.
+    """Check that joint samples cover a tip's exposure; return the rejection.
 
     Parameters
     ----------

@@ -76,8 +76,8 @@ def test_the_command_prints_the_forecast(
     path, result = tmp_path / "tips.csv", tmp_path / "result.json"
     header = "insertion_m,x_m,y_m,z_m,rotation_rad"
     np.savetxt(path, table, delimiter=",", header=header, comments="")
-    words = [str(path), "--json", str(result)]
-    main([*words, "--forecast-mm", "98"])
+    argv = [str(path), "--json", str(result)]
+    main([*argv, "--forecast-mm", "98"])
     values = json.loads(result.read_text(encoding="utf-8"))
     assert f"at 98 mm the tip will be at x = {values['forecast_x_mm']:.2f}" in (
         capsys.readouterr().out
@@ -87,7 +87,7 @@ def test_the_command_prints_the_forecast(
         assert values[f"forecast_{name}_mm"] == pytest.approx(
             wanted, abs=values[f"forecast_{name}_95_mm"]
         )
-    main(words)
+    main(argv)
     assert json.loads(result.read_text(encoding="utf-8"))["forecast_x_mm"] is None
-    assert main([*words, "--forecast-mm", "0"]) == 2
+    assert main([*argv, "--forecast-mm", "0"]) == 2
     assert "--forecast-mm = 0" in capsys.readouterr().err

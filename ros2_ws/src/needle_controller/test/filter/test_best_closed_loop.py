@@ -18,17 +18,17 @@ STARTS = GRIDS["random"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)),
 
 
 def steered(
-    claimed: float, trouble: dict[str, Any], flips: int = 0, sigma_scale: float = 1.0
+    claimed: float, disturbances: dict[str, Any], flips: int = 0, sigma_scale: float = 1.0
 ) -> Array:
     """Return true x over the last 20 mm, shape (40, 20) [m]."""
     depths = tuple(np.linspace(0.0, 0.12, flips + 2)[1:-1].tolist())
-    study = StudySettings(CURVATURE, 0.12, STEP, Disturbances(**trouble), seed=11)
+    study = StudySettings(CURVATURE, 0.12, STEP, Disturbances(**disturbances), seed=11)
     controller = controller_factory("best", claimed, depths, sigma_scale=sigma_scale)
     return np.asarray(run_study(STARTS, controller, study).x_last[:, -20:])
 
 
 @pytest.mark.parametrize(
-    ("least", "largest_rms", "flips", "trouble"),
+    ("least", "largest_rms", "flips", "disturbances"),
     [
         (0.97, 0.0005, 0, {"curvature_scale": 0.8}),
         (0.97, 0.0005, 0, {"curvature_scale": 1.2}),
@@ -38,8 +38,10 @@ def steered(
         (0.97, 0.0005, 11, {}),
     ],
 )
-def test_converges(least: float, largest_rms: float, flips: int, trouble: dict[str, Any]) -> None:
-    x = steered(0.001, {"noise": 0.001, **trouble}, flips)
+def test_converges(
+    least: float, largest_rms: float, flips: int, disturbances: dict[str, Any]
+) -> None:
+    x = steered(0.001, {"noise": 0.001, **disturbances}, flips)
     assert np.mean(np.abs(x[:, -1]) <= 0.001) >= least
     assert np.sqrt(np.mean(x**2)) <= largest_rms
 
@@ -52,7 +54,7 @@ def test_an_accurate_sensor_does_not_cause_overconfidence(
     noise: float, sigma_scale: float, play_deg: float
 ) -> None:
     """With tips this accurate, a linear filter would be certain of a wrong roll."""
-    trouble = {"noise": noise, "play": np.deg2rad(play_deg)}
-    x = steered(noise, trouble, sigma_scale=sigma_scale)
+    disturbances = {"noise": noise, "play": np.deg2rad(play_deg)}
+    x = steered(noise, disturbances, sigma_scale=sigma_scale)
     assert np.mean(np.abs(x) <= 0.001) >= 0.995
     assert np.sqrt(np.mean(x**2)) <= 0.00025

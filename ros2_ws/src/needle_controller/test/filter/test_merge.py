@@ -35,7 +35,7 @@ def merged(h: Records) -> Records:
 def test_only_equal_hypotheses_are_merged() -> None:
     h = hypotheses(np.array([0.0, 0.2, 1.0, 0.1, 3.1, -3.1]))
     h["torsion"][3] = 1
-    # 0 and 0.2; 3.1 and -3.1, across the border; 0.1 is of another torsion.
+    # 0 and 0.2; 3.1 and -3.1, across the border; 0.1 has another torsion.
     np.testing.assert_array_equal(merged(h)["weight"], [2.0, 1.0, 1.0, 2.0])
 
 

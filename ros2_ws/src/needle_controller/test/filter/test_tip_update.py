@@ -199,7 +199,7 @@ def test_the_noisier_coordinate_is_learnt() -> None:
 
 
 def with_state_of(after: Records, before: Records) -> Records:
-    """The learnt noise, with the old estimates."""
+    """Return the learnt noise with the old estimates."""
     h: Records = before.copy()
     h["noise_weights"] = after["noise_weights"]
     return h

@@ -18,7 +18,7 @@ from needle_controller.laws.point_turns import (
     affordable_reserve,
     insertion_to_closest_point,
     rest_after,
-    write_need,
+    write_lateral_offset,
 )
 from needle_controller.many_needles import ManyFilters
 from needle_controller.model.arrays import Array
@@ -63,13 +63,13 @@ def test_the_need_of_a_point_is_the_bending_of_its_arc() -> None:
     for share in (0.1, 0.9):
         curvature = share * CURVATURE
         tip_in_start = moved(np.eye(4), length, 0.0, curvature)[:3, 3].copy()
-        assert write_need(tip_in_start, need) == pytest.approx(length)
+        assert write_lateral_offset(tip_in_start, need) == pytest.approx(length)
         # Towards -y, the direction in which an unturned bevel bends.
         np.testing.assert_allclose(need, [0.0, -0.5 * curvature * length**2], atol=1e-12)
-    # A point beside or behind the tip needs no bending and is passed.
-    assert write_need(np.array([0.001, 0.0, -0.002]), need) == -0.002
+    # A point next to or behind the tip needs no bending and is passed.
+    assert write_lateral_offset(np.array([0.001, 0.0, -0.002]), need) == -0.002
     np.testing.assert_array_equal(need, 0.0)
-    assert write_need(np.array([0.0, 0.0, 0.05]), need) == 0.05
+    assert write_lateral_offset(np.array([0.0, 0.0, 0.05]), need) == 0.05
 
 
 def test_an_unreachable_point_is_nearest_at_the_returned_length() -> None:
@@ -80,7 +80,7 @@ def test_an_unreachable_point_is_nearest_at_the_returned_length() -> None:
         aside, ahead = np.hypot(target[0], target[1]), target[2]
         nearest = np.argmin(np.hypot(x - aside, z - ahead)) // len(bend)
         found = insertion_to_closest_point(
-            np.array(target), write_need(np.array(target), np.empty(2)), CURVATURE
+            np.array(target), write_lateral_offset(np.array(target), np.empty(2)), CURVATURE
         )
         assert found == pytest.approx(lengths[nearest, 0], abs=1e-4)
 
@@ -127,7 +127,7 @@ def test_the_turn_budget_is_kept_and_two_half_turns_reach_the_point(budget_deg: 
 
 
 def next_turn(left: float, kept: float) -> float:
-    """Return the rest after bending with 1 - kept of the curvature, then as much across [m]."""
+    """Return the length left after bending by 1 - kept of the curvature and back [m]."""
     need = (1.0 - kept) * left**2
 
     def beyond(end: float) -> float:
@@ -160,7 +160,7 @@ def test_a_turn_waits_as_long_as_a_later_one_suffices() -> None:
     # With more uncertainty it turns earlier.
     unsure = law()(estimate(entry(), std=np.deg2rad(10.0)), AHEAD).rotation_rate
     assert abs(float(unsure)) == pytest.approx(CAP)
-    # Half a turn takes 6 mm; 3 mm before the point it is made only if that ends nearer.
+    # Half a turn takes 6 mm: 3 mm before the point, turn only if it ends nearer.
     assert float(law()(estimate(entry()), [0.00006, 0.00005, 0.003]).rotation_rate) > 0.0
     near = law(close_enough=0.0001)(estimate(entry()), [0.0, 0.00002, 0.003])
     assert near.rotation_rate == 0.0
@@ -189,7 +189,7 @@ def test_torsion_makes_the_turn_start_earlier() -> None:
         ahead = np.arange(0.1, 0.0, -0.001)
         return float(next(z for z in ahead if law()(needle, [0.0, 0.0, z]).rotation_rate != 0.0))
 
-    # A play takes 1.3 mm to turn through at 30 deg/mm, a lag its 8 mm.
+    # Turning through the play takes 1.3 mm at 30 deg/mm; a lag takes its 8 mm.
     for columns in ({"lag": 0.008}, {"play": 0.7}):
         assert waits_until(mixture([0.0], **columns)) > waits_until(mixture([0.0])) + 0.001
 

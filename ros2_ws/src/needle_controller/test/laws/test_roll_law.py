@@ -105,7 +105,7 @@ def test_play_and_lag_are_compensated() -> None:
     assert base_turn(torsion(play=0.5), 0.0, 0.3, STEP) == 0.0
     lead = base_turn(torsion(lag=0.008), 0.1, 0.0, STEP)
     assert lead * (1.0 - np.exp(-1.0 / 8.0)) == pytest.approx(0.1)
-    # Half of what the base turns reaches the tip.
+    # Half of the base rotation reaches the tip.
     assert base_turn(torsion(0.3, 0.3, gain=0.5), 0.1, 0.6, STEP) == pytest.approx(0.2)
     # Without a further turn, the base returns to the angle of the tip.
     assert base_turn(torsion(0.2, 0.9, lag=0.008), 0.0, 0.9, STEP) == pytest.approx(-0.7)

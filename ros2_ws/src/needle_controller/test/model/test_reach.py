@@ -112,7 +112,7 @@ def test_no_path_is_shorter_than_the_least_insertion_or_beyond_the_widest_offset
         widest = widest_at(ahead, CURVATURE)
         assert not np.isnan(least_insertion_to_point([0.0, widest - 1e-6, ahead], CURVATURE))
         assert np.isnan(least_insertion_to_point([0.0, widest + 1e-6, ahead], CURVATURE))
-    # Within the circle a tolerance may help; a target beside or behind the tip may be reached
+    # Within the circle a tolerance may help; a target next to or behind the tip may be reached
     # already.
     radius = 1.0 / CURVATURE
     inside = np.array([radius - np.sqrt((radius - 0.0005) ** 2 - 0.06**2), 0.0, 0.06])

@@ -21,7 +21,7 @@ BREATH = np.array([0.002, 0.001, -0.002])
 Path = Callable[[float], Array]
 
 
-def seen(path: Path, end: float, every: float = 0.25, begin: float = 0.0) -> TargetMotion:
+def observed(path: Path, end: float, every: float = 0.25, begin: float = 0.0) -> TargetMotion:
     motion = TargetMotion()
     for time in np.arange(0.0, end + 1e-9, every):
         motion.observe(begin + float(time), path(float(time)))
@@ -83,43 +83,43 @@ def test_unreachable_planes_are_rejected() -> None:
 
 def test_a_target_at_rest_or_hardly_observed_is_predicted_exactly_at_its_last_position() -> None:
     for motion in (
-        seen(lambda _: PLACE, 0.0),
-        seen(lambda _: PLACE, 30.0),
-        seen(sine(0.2), SHORTEST - 0.25),
+        observed(lambda _: PLACE, 0.0),
+        observed(lambda _: PLACE, 30.0),
+        observed(sine(0.2), SHORTEST - 0.25),
     ):
         np.testing.assert_array_equal(motion.at(60.0), motion.last)
     walk = np.cumsum(np.random.default_rng(4).normal(0.0, 1e-3, (200, 3)), axis=0)
-    walking = seen(lambda t: np.asarray(PLACE + walk[round(t / 0.25)]), 25.0)
+    walking = observed(lambda t: np.asarray(PLACE + walk[round(t / 0.25)]), 25.0)
     np.testing.assert_allclose(walking.at(60.0), walking.last, atol=1e-5)
 
 
-def test_the_prediction_restarts_when_time_goes_back() -> None:
-    motion = seen(sine(0.2), 25.0)
+def test_the_prediction_restarts_when_time_is_set_back() -> None:
+    motion = observed(sine(0.2), 25.0)
     for time in np.arange(3.0, 13.0, 0.25):
         motion.observe(float(time), drift(float(time)))
     np.testing.assert_allclose(motion.at(15.0), drift(15.0), atol=1e-4)
 
 
-def test_a_motion_is_predicted_whatever_its_shape_and_clock() -> None:
+def test_a_motion_is_predicted_for_any_shape_and_clock() -> None:
     for path, begin in itertools.product((drift, sine(0.12), sine(0.33), chest(0.2)), (0.0, 1.7e9)):
-        motion = seen(path, 25.0, begin=begin)
+        motion = observed(path, 25.0, begin=begin)
         for time in (26.0, 30.0, 35.0):
             np.testing.assert_allclose(motion.at(begin + time), path(time), atol=1e-4)
 
 
 def test_a_fast_drift_is_predicted_after_three_seconds() -> None:
     path: Path = lambda t: PLACE + 30.0 * DRIFT * t  # noqa: E731
-    np.testing.assert_allclose(seen(path, 3.0).at(50.0), path(50.0), atol=1e-3)
+    np.testing.assert_allclose(observed(path, 3.0).at(50.0), path(50.0), atol=1e-3)
     # A breath that resembles a drift for so long is not followed far away.
     for rate in (0.1, 0.15, 0.2, 0.33):
-        away = seen(sine(rate), 3.0).at(50.0) - PLACE
+        away = observed(sine(rate), 3.0).at(50.0) - PLACE
         assert np.linalg.norm(away) < 0.015
 
 
 def test_noise_is_averaged() -> None:
     rng, path, errors = np.random.default_rng(2), sine(0.2), []
     for _ in range(10):
-        motion = seen(lambda t: path(t) + rng.normal(0.0, 3e-4, 3), 25.0, every=0.1)
+        motion = observed(lambda t: path(t) + rng.normal(0.0, 3e-4, 3), 25.0, every=0.1)
         errors.append(motion.at(30.0) - path(30.0))
     # as good as one sample alone, which is 0.3 mm
     assert np.sqrt(np.mean(np.square(errors))) < 2e-4
@@ -128,20 +128,20 @@ def test_noise_is_averaged() -> None:
 def test_after_a_jump_a_target_breathes_about_its_new_position() -> None:
     calm = sine(0.2)
     path: Path = lambda t: calm(t) + (0.003 if t > 20.0 else 0.0)  # noqa: E731
-    assert np.linalg.norm(seen(path, 20.5).last - path(20.5)) == 0.0
-    np.testing.assert_allclose(seen(path, 32.0).at(36.0), path(36.0), atol=1e-4)
+    assert np.linalg.norm(observed(path, 20.5).last - path(20.5)) == 0.0
+    np.testing.assert_allclose(observed(path, 32.0).at(36.0), path(36.0), atol=1e-4)
 
 
 def test_many_targets_equal_single_ones() -> None:
     paths: list[Path] = [sine(0.2), chest(0.3), lambda _: PLACE, drift]
-    both = seen(lambda t: np.stack([path(t) for path in paths]), 25.0)
+    both = observed(lambda t: np.stack([path(t) for path in paths]), 25.0)
     times = np.array([26.0, 27.0, 28.0, 29.0])
-    alone = [seen(path, 25.0).at(time) for path, time in zip(paths, times, strict=True)]
+    alone = [observed(path, 25.0).at(time) for path, time in zip(paths, times, strict=True)]
     np.testing.assert_allclose(both.at(times), alone, atol=1e-9)
 
 
 def test_a_fast_topic_takes_no_more_memory_than_a_slow_one() -> None:
-    fast, slow = seen(sine(0.2), 25.0, every=0.01), seen(sine(0.2), 25.0)
+    fast, slow = observed(sine(0.2), 25.0, every=0.01), observed(sine(0.2), 25.0)
     assert len(fast._times) <= 1.1 * len(slow._times)
     np.testing.assert_allclose(fast.at(30.0), sine(0.2)(30.0), atol=1e-4)
 

@@ -38,7 +38,7 @@ def may(obstacles: Obstacles, tip: TipState = ENTRY, target: Array = TARGET) -> 
 
 @pytest.fixture(scope="module", autouse=True)
 def _loaded() -> None:
-    """Compiled code is loaded once, outside of the tests."""
+    """Load compiled code once, outside the tests."""
     may(Obstacles())
 
 

@@ -126,7 +126,7 @@ def test_the_path_ends_at_the_depth_and_steering_there() -> None:
         rig.expose_tip()
         assert rig.path is not None
         assert rig.path.points[-1][0] <= 2.5 * MM
-    # An axis rests beside its goal: the last tip is used there, and the path leads to the end.
+    # An axis rests off its goal: the last tip is used there, and the path leads to the end.
     assert rig.steering.insertion == rig.insertion
     rig.go(MM)
     assert rig.steering.state is SteeringState.DONE

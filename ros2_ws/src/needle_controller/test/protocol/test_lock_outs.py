@@ -119,7 +119,7 @@ def test_after_a_joint_jump_the_needle_must_be_out_or_back() -> None:
     assert rig.good_tips().insertion == pytest.approx(0.001)
 
 
-def test_steering_stops_when_the_clock_goes_back_and_can_restart() -> None:
+def test_steering_stops_when_the_clock_is_set_back_and_can_restart() -> None:
     rig = Rig()
     rig.now += 100 * SECOND
     rig.settle()

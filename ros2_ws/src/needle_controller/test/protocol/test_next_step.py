@@ -70,9 +70,9 @@ def test_confidence_follows_from_covariance_and_miss_probability() -> None:
     assert elsewhere.is_doubtful
     wide = np.diag([1.1e-6, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert assess_confidence(dataclasses.replace(estimate, covariance=wide)).is_doubtful
-    # Without a miss probability there is no verdict.
-    unjudged = assess_confidence(dataclasses.replace(estimate, miss=None), 0.72)
-    assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
+    # No miss probability: no verdict.
+    without_probability = assess_confidence(dataclasses.replace(estimate, miss=None), 0.72)
+    assert (without_probability.verdict, without_probability.is_doubtful) == ("", False)
 
 
 def test_the_miss_probability_of_a_point_is_its_frequency() -> None:

@@ -170,7 +170,7 @@ def test_an_update_contains_turn_miss_probability_and_reach() -> None:
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.004])
-def test_the_tip_ends_at_the_point_whatever_the_plane(offset: float) -> None:
+def test_the_tip_ends_at_the_point_for_any_plane(offset: float) -> None:
     needle = Needle(dataclasses.replace(TO_POINT, target_offset=offset)).steer()
     assert needle.off(POINT) < 0.0006
     assert needle.reachable[0]
@@ -193,16 +193,16 @@ def test_a_moving_point_is_reached_if_its_clock_is_known() -> None:
     for apart in (0.0, 1.7e9, None):
         needle = Needle(TO_POINT)
 
-        def see(_: int, needle: Needle = needle, apart: float | None = apart) -> None:
+        def observe(_: int, needle: Needle = needle, apart: float | None = apart) -> None:
             if apart is None:
                 needle.control.target_point = breathing(needle.time)
             else:
                 needle.control.observe_target_point(breathing(needle.time), needle.time + apart)
 
-        needle.steer(30, before=see)
+        needle.steer(30, before=observe)
         ends.append(needle.tip)
         if apart == 0.0:
-            needle.steer(before=see)
+            needle.steer(before=observe)
             assert needle.off(breathing(needle.time)) < 0.0006
     # With stamps of another clock, the last observed position is used.
     np.testing.assert_array_equal(ends[1], ends[2])
@@ -263,7 +263,7 @@ def test_the_reason_without_path_names_an_entry_with_a_path() -> None:
     assert "the target point is -0.004 m from an obstacle" in control.path_problem(0.0)
     control.obstacles = Obstacles([Obstacle((0.0, 0.0, 0.003), (0.0, 0.0, 0.003), 0.004)])
     assert "the entry is -0.001 m from an obstacle" in control.path_problem(0.0)
-    # A wall that ends at y = 6 mm: from an entry farther in +y there is room beside it.
+    # A wall that ends at y = 6 mm: from an entry farther in +y the path is clear.
     control.obstacles = Obstacles(
         [Obstacle((-0.06, y, 0.025), (0.06, y, 0.025), 0.011) for y in (-0.045, -0.025, -0.005)]
     )

@@ -49,12 +49,12 @@ def test_start_waits_until_joints_and_device_agree() -> None:
             dataclasses.replace(HOLDING, insertion_m=insertion, rotation_rad=rotation)
         )
         assert ("waiting for joint_states to agree" not in rig.start()) is agree
-    for unsaid in (
+    for incomplete in (
         dataclasses.replace(HOLDING, insertion_m=None),
         dataclasses.replace(HOLDING, rotation_rad=None),
     ):
         rig = Rig(started=False, insertion=0.001)
-        rig.steering.on_device(unsaid)
+        rig.steering.on_device(incomplete)
         assert rig.start() == "steering"
     rig = Rig(started=False, insertion=0.0015)
     rig.steering.on_device(HOLDING)

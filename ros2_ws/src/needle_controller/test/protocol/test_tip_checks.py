@@ -34,7 +34,7 @@ def fault(refusal: RejectedTip | None) -> TipFault | None:
     return None if refusal is None else refusal.fault
 
 
-def test_bad_messages_are_rejected_whatever_the_joints() -> None:
+def test_bad_messages_are_rejected_regardless_of_the_joints() -> None:
     for measured, wanted in (
         (tip(0.0, 0.0, 0.02, stamp_ns=51), None),
         (tip(0.0, 0.0, 0.02, stamp_ns=50), TipFault.NOT_NEWER),

@@ -12,7 +12,7 @@ from needle_core.errors import UserError
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """YAML loader that rejects duplicate keys, as the second would silently replace the first."""
+    """YAML loader that rejects duplicate keys, because the second would silently win."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
         keys: set[str] = set()

@@ -85,7 +85,7 @@ class Worker:
 def _work() -> int:
     """Apply the function to the items of the standard input, until it ends."""
     items, results = os.fdopen(0, "rb"), sys.stdout.buffer
-    # What a library prints must not end up between the results.
+    # Output of libraries must not be mixed with the results.
     with contextlib.redirect_stdout(sys.stderr):
         make, arguments = pickle.load(items)
         function = make(*arguments)
@@ -96,5 +96,5 @@ def _work() -> int:
 
 
 if __name__ == "__main__":
-    # Nothing is left to clean up, so the interpreter's own shutdown could only take time.
+    # Nothing is left to clean up: skip the slow shutdown of the interpreter.
     os._exit(run_command(_work))

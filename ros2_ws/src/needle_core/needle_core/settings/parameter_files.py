@@ -100,7 +100,7 @@ def missing_section_warning(source: object, sections: Sections, node: str) -> st
     return f"{source}: no section for {node}: it has {', '.join(sections) or 'none'}"
 
 
-def command_line_sections(words: Sequence[str]) -> list[tuple[str, Sections]]:
+def command_line_sections(argv: Sequence[str]) -> list[tuple[str, Sections]]:
     """Return the parameters on a node's command line: (file or `-p` as given, sections).
 
     Raises
@@ -109,7 +109,7 @@ def command_line_sections(words: Sequence[str]) -> list[tuple[str, Sections]]:
         For the same reasons as `read_sections`.
     """
     given: list[tuple[str, Sections]] = []
-    ros = words[words.index("--ros-args") :] if "--ros-args" in words else []
+    ros = argv[argv.index("--ros-args") :] if "--ros-args" in argv else []
     for option, text in itertools.pairwise(ros):
         if option == "--params-file":
             given.append((text, read_sections(Path(text))))
@@ -119,12 +119,12 @@ def command_line_sections(words: Sequence[str]) -> list[tuple[str, Sections]]:
     return given
 
 
-def check_command_line(words: Sequence[str], node: str) -> list[str]:
+def check_command_line(argv: Sequence[str], node: str) -> list[str]:
     """Check that the parameters on a node's command line take effect.
 
     Parameters
     ----------
-    words : sequence of str
+    argv : sequence of str
         The command line, with the executable.
     node : str
         Full name of the node, after remapping.
@@ -143,8 +143,8 @@ def check_command_line(words: Sequence[str], node: str) -> list[str]:
     overrides: dict[str, str] = {}
     # As in rcl, a section keeps the position of its first occurrence, and the last section wins.
     kept: dict[str, dict[str, str]] = {}
-    for source, sections in command_line_sections(words):
-        reached = matching_sections(source, sections, node, Path(words[0]).stem)
+    for source, sections in command_line_sections(argv):
+        reached = matching_sections(source, sections, node, Path(argv[0]).stem)
         if not reached:
             warnings.append(missing_section_warning(source, sections, node))
         for section, values in reached.items():

@@ -70,7 +70,7 @@ def test_an_internal_error_is_one_line_and_in_development_a_traceback_before_it(
     assert last.startswith("error: internal error")
 
 
-def test_a_closed_output_pipe_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_output_pipe_is_not_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     for count in (1, 10**6):
         reader, writer = os.pipe()
         os.close(reader)

@@ -21,13 +21,13 @@ from needle_core.errors import OutOfBoundsError, UserError
 def test_unknown_arguments_are_a_user_error_and_help_keeps_its_lines() -> None:
     parser = CommandParser("study", "Runs,\nand says so.", "example:\n  study --seed 1")
     parser.add_argument("--seed")
-    for words, complaint in (
+    for argv, complaint in (
         # Options cannot be abbreviated.
         (["--see", "1"], "unrecognized arguments: --see 1; see --help"),
         (["--seed"], "argument --seed: expected one argument; see --help"),
     ):
         with pytest.raises(UserError) as raised:
-            parser.parse_args(words)
+            parser.parse_args(argv)
         assert str(raised.value) == complaint
     assert "Runs,\nand says so." in parser.format_help()
     assert parser.format_help().endswith("example:\n  study --seed 1\n")

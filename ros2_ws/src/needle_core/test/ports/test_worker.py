@@ -20,7 +20,7 @@ from needle_core.component import PortChange
 from needle_core.ports import worker as module
 from needle_core.ports.worker import Worker
 
-PATIENCE = 60.0  # [s]
+TIMEOUT = 60.0  # [s]
 ENDED = PortChange("the worker process has ended")
 
 
@@ -33,7 +33,7 @@ class Calls:
         self.port.open(self.arrived.put)
 
     def next(self) -> Any:
-        return self.arrived.get(timeout=PATIENCE)
+        return self.arrived.get(timeout=TIMEOUT)
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_the_process_ends_with_its_parent(is_killed: bool) -> None:
         process = os.pidfd_open(int(parent.stdout.readline()))
         if is_killed:
             parent.kill()
-        parent.communicate(timeout=PATIENCE)
+        parent.communicate(timeout=TIMEOUT)
         # The descriptor of a process becomes readable when it ends.
-        assert select.select([process], [], [], PATIENCE)[0] == [process]
+        assert select.select([process], [], [], TIMEOUT)[0] == [process]
         os.close(process)

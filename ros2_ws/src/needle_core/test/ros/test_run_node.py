@@ -52,9 +52,9 @@ def middleware(monkeypatch: pytest.MonkeyPatch) -> Middleware:
     return Middleware(monkeypatch)
 
 
-def run(create: Any, *words: str, spin: Any = None) -> int:
+def run(create: Any, *argv: str, spin: Any = None) -> int:
     return run_node(
-        create, help_text="HELP", parameters=NoParameters, args=["node", *words], spin=spin
+        create, help_text="HELP", parameters=NoParameters, args=["node", *argv], spin=spin
     )
 
 
@@ -106,18 +106,18 @@ def test_arguments_are_explained_or_rejected_before_the_start(
     for word in ("--help", "-h"):
         assert run(None, word) == 0
         assert capsys.readouterr().out.startswith("HELP\n")
-    for words, cause in (
+    for argv, cause in (
         (("--fast",), "'--fast'; see --help"),
         (("-p", "x:=1"), "'-p'; put it after --ros-args"),
         (("rate:=1", "--ros-args", "-p", "other:=1"), "set a parameter with --ros-args -p rate:=1"),
         (("--ros-args", "--params-file", "none.yaml"), "none.yaml: cannot be read"),
     ):
-        assert run(None, *words) == 2
+        assert run(None, *argv) == 2
         assert cause in capsys.readouterr().err
     assert middleware.done == []
 
 
-def test_a_node_whose_construction_fails_is_gone() -> None:
+def test_a_node_whose_construction_fails_is_destroyed() -> None:
     gone: list[WholeNode] = []
 
     class Half(WholeNode):

@@ -92,7 +92,7 @@ class Wired(Component):
         self.name = name
         self.count = 0
         self.arrived: list[tuple[float, int]] = []
-        self.ports = (Port("wire", self._take),)
+        self.ports = (Port("wire", self._receive),)
         self.timers = (Timer(0.0005, self._send),) if sends else ()
 
     def _send(self, at: Moment) -> Actions:
@@ -100,7 +100,7 @@ class Wired(Component):
             self.count += 2
             yield Send("wire", (self.count - 1, self.count))
 
-    def _take(self, batch: Sequence[int], at: Moment) -> Actions:
+    def _receive(self, batch: Sequence[int], at: Moment) -> Actions:
         self.arrived += [(at.steady, number) for number in batch]
         return ()
 

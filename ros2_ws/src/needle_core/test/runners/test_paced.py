@@ -75,7 +75,7 @@ class Scene:
 
 
 @pytest.mark.parametrize("pace", [0.5, 1.0, 4.0])
-def test_virtual_time_goes_at_the_pace_of_the_wall_clock(pace: float) -> None:
+def test_virtual_time_runs_at_the_pace_of_the_wall_clock(pace: float) -> None:
     scene = Scene(pace)
     begin = scene.wall.now
     for _ in range(3):
@@ -117,7 +117,7 @@ def test_a_long_delay_is_lost_and_reported_and_no_time_is_skipped(pace: float) -
     assert scene.runner.lag == pytest.approx(3.0, abs=SLACK)
     assert scene.wall.now - begin == pytest.approx(2.0 + scene.runner.lag)
     assert len(scene.worker.ticks) == pytest.approx(2.0 * pace / PERIOD, abs=1)
-    # After the delay the needle goes no faster than before.
+    # The needle does not speed up after the delay.
     late = [wall for steady, wall in scene.worker.ticks if steady > pace]
     assert late[-1] - late[0] == pytest.approx((len(late) - 1) * PERIOD / pace)
 

@@ -202,7 +202,7 @@ def test_a_component_that_exits_does_nothing_more_and_ends_the_run() -> None:
 
 def test_a_batch_arrives_in_order_at_all_ports_of_the_same_name() -> None:
     one, other, third = Wired("one", sends=True), Wired("other"), Wired("third")
-    third.ports = (Port("another wire", third._take),)
+    third.ports = (Port("another wire", third._receive),)
     VirtualRunner([one, other, third]).run(0.1)
     numbers = [number for _, number in other.arrived]
     # Ports are connected at once, while discovery takes time.
@@ -219,11 +219,11 @@ def test_waiting_input_of_a_port_is_one_batch() -> None:
     batches: list[int] = []
     one, other = Wired("one", sends=True), Wired("other")
 
-    def take(batch: Sequence[int], at: Moment) -> Actions:
+    def receive(batch: Sequence[int], at: Moment) -> Actions:
         batches.append(len(batch))
-        return other._take(batch, at)
+        return other._receive(batch, at)
 
-    other.ports = (Port("wire", take),)
+    other.ports = (Port("wire", receive),)
     runner, published = run([one, other], seconds=0.0)
     runner.run(0.1)
     assert max(batches) <= 6
@@ -240,7 +240,7 @@ def test_a_port_is_lost_and_reopened_also_for_a_component_that_starts_meanwhile(
 
     def wired(name: str, *, sends: bool = False) -> Wired:
         component = Wired(name, sends=sends)
-        component.ports = (Port("wire", component._take, note),)
+        component.ports = (Port("wire", component._receive, note),)
         return component
 
     def note(change: PortChange, at: Moment) -> Actions:

@@ -29,8 +29,8 @@ def file(tmp_path: Path) -> Path:
 def checked(file: Path, text: str, node: str, *more: str) -> list[str]:
     """Check the command line of a node that was started as device_driver."""
     file.write_text(text)
-    words = ["/lib/device_driver", "--ros-args", "--params-file", str(file), *more]
-    return check_command_line(words, node)
+    argv = ["/lib/device_driver", "--ros-args", "--params-file", str(file), *more]
+    return check_command_line(argv, node)
 
 
 def test_sections_for_other_names_stop_the_node(file: Path) -> None:
@@ -62,7 +62,7 @@ def test_a_misspelt_node_is_named(file: Path) -> None:
 
 
 def test_a_file_that_is_not_a_parameter_file_is_a_one_line_error(file: Path) -> None:
-    for text, words in (
+    for text, message in (
         (f"{DRIVES}\nsim_rig: {{}}\n{DRIVES}", "duplicate key 'device_driver' in line 3"),
         (f"{DRIVES}\n/{DRIVES}", "'/device_driver' is a duplicate"),
         (f"rig1: {{{DRIVES}}}\n/rig1/{DRIVES}", "'/rig1/device_driver' is a duplicate"),
@@ -76,23 +76,23 @@ def test_a_file_that_is_not_a_parameter_file_is_a_one_line_error(file: Path) -> 
         with pytest.raises(UserError) as caught:
             read_sections(file)
         assert str(caught.value).startswith(f"{file}: ")
-        assert words in str(caught.value)
+        assert message in str(caught.value)
         assert "\n" not in str(caught.value)
 
 
 def test_an_override_for_another_name_stops_the_node(file: Path) -> None:
-    words = ("-p", "device_driver:max_depth:=0.06")
-    assert checked(file, "/**: {ros__parameters: {}}", "/device_driver", *words) == []
+    argv = ("-p", "device_driver:max_depth:=0.06")
+    assert checked(file, "/**: {ros__parameters: {}}", "/device_driver", *argv) == []
     with pytest.raises(UserError, match=r"-p device_driver:max_depth:=0\.06: section 'device_dri"):
-        checked(file, "/**: {ros__parameters: {}}", "/rig1/device_driver", *words)
+        checked(file, "/**: {ros__parameters: {}}", "/rig1/device_driver", *argv)
 
 
 def test_an_override_that_ros_puts_below_a_file_stops_the_node(file: Path) -> None:
-    words, every = ("-p", "max_depth:=0.06"), "/**: {ros__parameters: {use_sim_time: false}}"
+    argv, every = ("-p", "max_depth:=0.06"), "/**: {ros__parameters: {use_sim_time: false}}"
     for reaches in (DRIVES, f"{DRIVES}\n{every}"):
-        assert checked(file, reaches, "/device_driver", *words) == []
+        assert checked(file, reaches, "/device_driver", *argv) == []
     with pytest.raises(UserError) as caught:
-        checked(file, f"{every}\n{DRIVES}", "/device_driver", *words)
+        checked(file, f"{every}\n{DRIVES}", "/device_driver", *argv)
     assert str(caught.value).startswith(
         "-p max_depth:=0.06 does not reach /device_driver, section 'device_driver' of "
         f"{file} overrides it:"

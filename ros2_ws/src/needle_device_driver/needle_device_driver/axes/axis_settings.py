@@ -13,7 +13,7 @@ PRESENT_POSITION_METHODS = (35, 37)
 class AxisSettings:
     """Axis settings common to all kinds of drives, from checked parameters; lengths in m or rad.
 
-    The parameters that they come from are checked.
+    Derived from checked parameters.
 
     Attributes
     ----------

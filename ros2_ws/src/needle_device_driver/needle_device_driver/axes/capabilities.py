@@ -8,7 +8,7 @@ import math
 
 @dataclasses.dataclass(frozen=True)
 class Capabilities:
-    """Abilities of a drive; the motion supervisor does the rest.
+    """Abilities of a drive; the motion supervisor makes up for missing ones.
 
     Attributes
     ----------
@@ -44,5 +44,5 @@ class Capabilities:
 
     @property
     def has_watchdog(self) -> bool:
-        """Whether it stops by itself when the computer is silent."""
+        """Whether the drive stops on its own when the computer is silent."""
         return math.isfinite(self.watchdog)

@@ -98,7 +98,7 @@ class DriveMachine:
     @property
     def powered(self) -> bool:
         """Whether the drive is on because of the present order, moving or stopped."""
-        # Excludes a drive that is still on from before, or in another mode.
+        # Excludes a drive that is still on, or in another mode.
         on = self.state in POWERED and self.at.mode == self.mode
         return self._goal is not Goal.OFF and (on or self._switched_off_temporarily)
 

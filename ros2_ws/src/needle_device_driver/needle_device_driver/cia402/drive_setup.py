@@ -259,7 +259,7 @@ def _map_optional(
             yield from _map_pdo(access, node, full)
             return []
     except DriveRefusalError:
-        # The entry cannot be mapped; any other reason also shows in the next attempt.
+        # The entry cannot be mapped; any other error recurs in the next attempt.
         pass
     yield from _map_pdo(access, node, without)
     return [missing]

@@ -53,7 +53,7 @@ def check_step(rig: ConformanceRig) -> None:
     assert rig.hand.results.get(stamp) == "succeeded", (rig.hand.results, rig.logged)
 
 
-def are_off(rig: ConformanceRig, *others: str) -> bool:
+def are_switched_off(rig: ConformanceRig, *others: str) -> bool:
     """Return whether the state of each emulated drive begins with one of `_OFF` or `others`."""
     states = [s for drives in rig.drives.connections.values() for s in drives.states().values()]
     return all(state.startswith((*_OFF, *others)) for state in states)

@@ -104,7 +104,7 @@ def no_motion_by_itself(make: MakeRig) -> None:
     while rig.state != "DISABLED":
         rig.runner.run(PERIOD / 4.0)
         # A drive may be on from its power-up until its set-up.
-        is_off = checks.are_off(rig)
+        is_off = checks.are_switched_off(rig)
         assert is_off or not was_off
         was_off = is_off
     rig.call("device/confirm_needle_out", True)
@@ -123,14 +123,14 @@ def no_motion_by_itself(make: MakeRig) -> None:
     rig.runner.kill(DRIVER)
     rig.runner.start(DeviceDriver(rig.settings))
     rig.runner.run(2.0)
-    assert checks.are_off(rig, "FAULT")
+    assert checks.are_switched_off(rig, "FAULT")
     rig = make()
     rig.ready()
     rig.runner.stop(DRIVER)
     # The first run returns when the driver ends.
     rig.until(lambda: not rig.runner.runs(DRIVER), "the end of the driver")
     rig.runner.run(1.0)
-    assert checks.are_off(rig)
+    assert checks.are_switched_off(rig)
 
 
 def drive_emergency(make: MakeRig) -> None:
@@ -315,7 +315,7 @@ def loop_heartbeat(make: MakeRig) -> None:
 
 def _check_stopped(rig: ConformanceRig) -> None:
     rig.runner.run(0.4)
-    assert checks.are_off(rig, "FAULT")
+    assert checks.are_switched_off(rig, "FAULT")
 
 
 SCENARIOS: dict[Rule, Callable[[MakeRig], None]] = {

@@ -47,7 +47,7 @@ class DriveRefusalError(ObjectError):
 
     @property
     def object_is_missing(self) -> bool:
-        """Whether the drive does not have the entry at all."""
+        """Whether the drive does not have the entry."""
         return self.code in NO_SUCH_OBJECT
 
 

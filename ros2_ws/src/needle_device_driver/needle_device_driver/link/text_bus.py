@@ -241,7 +241,7 @@ class SocketcandBus(TextBus):
         return convert_can_message_to_ascii_message(message)
 
     def _decode(self, text: str) -> Message | None:
-        # What precedes the last start has no end.
+        # A frame before the last start byte is incomplete.
         message = convert_ascii_message_to_can_message(text[text.rfind("<") :])
         if message is None:
             raise ValueError("not a frame")

@@ -1,1 +1,1 @@
-"""Drives that answer requests: what Galil, Zaber and step/direction backends have in common."""
+"""Drives that answer requests: common code of the Galil, Zaber and step/direction backends."""

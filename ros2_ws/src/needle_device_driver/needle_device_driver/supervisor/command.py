@@ -302,7 +302,7 @@ class CommandHandler:
             insertion=at.insertion.set_point,
             rotation=at.rotation.set_point,
             homed=at.homed,
-            not_new=self.stamps.why_not_new(command.stamp_ns),
+            not_new=self.stamps.refusal_reason(command.stamp_ns),
             tip_age=self.stamps.age(command.stamp_ns, now),
             publishers=publishers,
         )

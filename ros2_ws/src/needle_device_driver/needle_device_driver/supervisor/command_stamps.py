@@ -61,7 +61,7 @@ class CommandStamps:
         self._last_ns = stamp_ns
         self._used_ns.append(stamp_ns)
 
-    def why_not_new(self, stamp_ns: int) -> str:
+    def refusal_reason(self, stamp_ns: int) -> str:
         """Return why a stamp is not new; empty: it is new."""
         last = self._last_ns
         if last is not None and stamp_ns <= last:

@@ -24,7 +24,7 @@ _SUPERVISED = (State.DISABLED, State.HOLDING, State.MOVING)
 
 
 class DeviceCore:
-    """Executes what the motion supervisor allows, and stops the axes on a fault.
+    """Executes the motions that the supervisor allows, and stops the axes on a fault.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class DeviceCore:
         """Report the outcome of a command."""
         self._events.append(CommandResult(stamp_ns, outcome))
 
-    def take_events(self) -> tuple[Event, ...]:
+    def pop_events(self) -> tuple[Event, ...]:
         """Return the events since the last call."""
         events = tuple(self._events)
         self._events.clear()

@@ -145,7 +145,7 @@ class MotionRun:
         )
 
     def _begin(self, at: PairSnapshot) -> CoordinatedMotion:
-        # Start at the last set-point: a motor may rest beside it, and a path from the measured
+        # Start at the last set-point: a motor may rest off it, and a path from the measured
         # position could begin with a jump of the set-point.
         start = at.insertion.set_point, at.rotation.set_point
         retracts, limits = self.activity is Activity.RETRACTION, self._limits

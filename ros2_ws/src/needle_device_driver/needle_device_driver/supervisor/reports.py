@@ -71,7 +71,7 @@ class ServiceResult:
     success : bool
         Whether the request was executed or begun.
     message : str
-        The reason, or what was done.
+        The reason for a refusal, or the action taken.
     """
 
     success: bool

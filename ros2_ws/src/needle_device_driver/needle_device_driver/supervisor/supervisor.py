@@ -24,7 +24,7 @@ class MotionSupervisor:
     """The only access to the axes; `now` is the steady time [s] in every method.
 
     A cycle is `drive(period, now)`, which orders set-points, then `observe(now)`, which reads and
-    checks the axes. `take_events` returns the reports.
+    checks the axes. `pop_events` returns the reports.
 
     Parameters
     ----------
@@ -81,9 +81,9 @@ class MotionSupervisor:
         """Reason for the state FAULT or ESTOPPED; otherwise empty."""
         return self._core.fault
 
-    def take_events(self) -> tuple[Event, ...]:
+    def pop_events(self) -> tuple[Event, ...]:
         """Return the events since the last call."""
-        return self._core.take_events()
+        return self._core.pop_events()
 
     def joints(self, now: float) -> PairSnapshot | None:
         """Return the measured joints; None if the feedback is older than the age limit."""

@@ -33,7 +33,7 @@ class ProtocolBench(Generic[P]):
             self.protocol.on_line(line)
 
     def reply(self, sent: bytes) -> None:
-        """Reply to what a procedure has sent."""
+        """Reply to the commands that a procedure has sent."""
 
     def run(self, procedure: Procedure[T]) -> T:
         def wait(is_there: Callable[[], bool], seconds: float) -> None:

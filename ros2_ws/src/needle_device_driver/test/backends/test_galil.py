@@ -35,20 +35,20 @@ class Script(ProtocolBench[GalilProtocol]):
         self.first: dict[str, str] = {}
         self.commands: list[str] = []
 
-    def take(self, sent: bytes | None = None) -> list[str]:
+    def pop_commands(self, sent: bytes | None = None) -> list[str]:
         """Return the commands in sent bytes; | is a line end in a download."""
         data = (self.sent() if sent is None else sent).decode()
         program, backslash, rest = data.partition("\\")
         commands = (rest if backslash else data).replace(";", "\r").split("\r")[:-1]
         return [program.replace("\r", "|") + "\\"] * bool(backslash) + commands
 
-    def say(self, text: str) -> None:
+    def receive_text(self, text: str) -> None:
         self.receive(text.encode("latin-1"))
 
     def reply(self, sent: bytes) -> None:
-        for command in self.take(sent):
+        for command in self.pop_commands(sent):
             self.commands += [command] * (command != BEAT)
-            self.say(self.first.pop(command, "") or self.replies.get(command, ":"))
+            self.receive_text(self.first.pop(command, "") or self.replies.get(command, ":"))
 
     def ready(self) -> Script:
         self.set_up()
@@ -58,8 +58,8 @@ class Script(ProtocolBench[GalilProtocol]):
     def answered(self, a: str = REST, c: str = REST, line: int = 1, time: int = 100) -> DriveReply:
         """Request the state, answer, and return the state of the insertion axis."""
         self.protocol.request(7)
-        self.take()
-        self.say(STATE.format(a=a, c=c, line=line, time=time))
+        self.pop_commands()
+        self.receive_text(STATE.format(a=a, c=c, line=line, time=time))
         assert self.states[-1][0] == 7
         return self.state()
 
@@ -113,7 +113,7 @@ def test_orders() -> None:
     at.move_to("insertion", 6, 900)
     at.power("rotation", False)
     at.request(7)
-    assert script.take() == [
+    assert script.pop_commands() == [
         *(BEAT, "SHA", "PTA=1", "SPA=2002", "PAA=-12", "SPA=900", "PAA=5", "STA"),
         *("PTA=1", "SPA=900", "PAA=6", "STC", "MOC", REQUEST),
     ]
@@ -149,21 +149,23 @@ def test_a_lagging_axis_catches_up_within_two_cycles(reference: int, speed: int)
     script = Script(max_speed=0.005).ready()
     script.answered(f"0.0000 {reference}.0000 12.0000 0.0000")
     script.protocol.move_to("insertion", 0, 2001)
-    assert script.take()[1] == f"SPA={speed + speed % 2}"
+    assert script.pop_commands()[1] == f"SPA={speed + speed % 2}"
 
 
 def test_a_limit_ends_position_tracking_but_not_that_of_newer_orders() -> None:
     script = Script().ready()
     stopped = "50.0000 50.0000 8.0000 3.0000"
     script.protocol.move_to("insertion", 50, 100)
-    script.say(":::")
+    script.receive_text(":::")
     script.answered(stopped)
     script.protocol.request(6)
     script.protocol.move_to("insertion", 60, 900)
-    assert script.take()[1:] == ["PTA=1", "SPA=900", "PAA=60"]
-    script.say(STATE.format(a=stopped, c=REST, line=1, time=100).replace("7", "6", 1) + ":::")
+    assert script.pop_commands()[1:] == ["PTA=1", "SPA=900", "PAA=60"]
+    script.receive_text(
+        STATE.format(a=stopped, c=REST, line=1, time=100).replace("7", "6", 1) + ":::"
+    )
     script.protocol.move_to("insertion", 70, 900)
-    assert script.take() == ["SPA=900", "PAA=70"]
+    assert script.pop_commands() == ["SPA=900", "PAA=70"]
 
 
 def test_the_watchdog_and_a_restart_show() -> None:
@@ -186,9 +188,9 @@ def test_the_watchdog_and_a_restart_show() -> None:
 def test_a_refused_order_is_a_fault_with_its_reason() -> None:
     script = Script().ready()
     script.protocol.move_to("insertion", 1, 100)
-    script.say("::?")
-    assert script.take()[-1] == "TC1"
-    script.say("20 Begin not valid with motor off\r\n:")
+    script.receive_text("::?")
+    assert script.pop_commands()[-1] == "TC1"
+    script.receive_text("20 Begin not valid with motor off\r\n:")
     fault = "refuses an order (error 20 Begin not valid with motor off)"
     assert script.answered().fault == fault
     script.run(script.protocol.clear_fault("insertion"))
@@ -197,8 +199,8 @@ def test_a_refused_order_is_a_fault_with_its_reason() -> None:
     assert script.commands == []
     # A controller may refuse MO while the axis moves.
     script.protocol.power("insertion", False)
-    script.say(":?")
-    assert script.take() == ["STA", "MOA"]
+    script.receive_text(":?")
+    assert script.pop_commands() == ["STA", "MOA"]
 
 
 @pytest.mark.parametrize(
@@ -220,20 +222,20 @@ def test_a_state_restores_the_order_of_replies(before: str) -> None:
     script.protocol.stop("insertion")
     script.protocol.request(6)
     script.protocol.request(7)
-    script.say(before)
+    script.receive_text(before)
     state = STATE.format(a=REST, c=REST, line=1, time=100)
     if before.startswith("\xcd"):
         # The rest of a garbled line is lost with it.
-        script.say(":")
+        script.receive_text(":")
     for byte in state:
-        script.say(byte)
+        script.receive_text(byte)
     assert [number for number, _ in script.states] == [7]
     assert (script.state().position, script.state("rotation").fault) == (0, "")
     # The next replies are matched again.
-    script.take()
+    script.pop_commands()
     script.protocol.move_to("rotation", 1, 2)
-    script.say("::?")
-    assert script.take()[-1] == "TC1"
+    script.receive_text("::?")
+    assert script.pop_commands()[-1] == "TC1"
 
 
 def test_the_release_switches_off_and_ends_the_program() -> None:
@@ -241,7 +243,7 @@ def test_the_release_switches_off_and_ends_the_program() -> None:
     script.first["MG _BGA"] = " 1.0000\r\n:"
     # The reply to a beat is lost.
     script.protocol.beat()
-    script.take()
+    script.pop_commands()
     script.run(script.protocol.release("insertion"))
     script.run(script.protocol.release("rotation"))
     assert script.commands == [

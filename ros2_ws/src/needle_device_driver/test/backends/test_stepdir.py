@@ -29,16 +29,16 @@ class Board(ProtocolBench[StepdirProtocol]):
             self.lines.append(line)
             number, _, rest = line[1:-3].partition(b",")
             if rest[:1] in self.replies:
-                self.say(number + b"," + rest[:1] + self.replies[rest[:1]])
+                self.receive_frame(number + b"," + rest[:1] + self.replies[rest[:1]])
 
-    def say(self, body: bytes) -> None:
+    def receive_frame(self, body: bytes) -> None:
         checksum = 0
         for byte in body:
             checksum ^= byte
         self.receive(b"$%s*%02X\n" % (body, checksum))
 
 
-def test_the_set_up_switches_off_and_tells_ramp_switch_and_dead_man() -> None:
+def test_the_set_up_switches_off_and_sends_ramp_switch_and_dead_man() -> None:
     board = Board(watchdog=0.15, rotation_reverse=True)
     assert board.run(board.protocol.identify()) == "stepdir 1"
     board.set_up()
@@ -60,8 +60,8 @@ def test_orders_and_a_request_have_these_bytes() -> None:
     # In pieces, after noise, and after a line without its checksum.
     board.receive(b"\xff\n$4,S,0,9,9,9,9*00\n$4,S,0,800,2", b"1,-250,27", b"*73\n")
     # The same answer again, and one to an unknown line.
-    board.say(b"4,S,0,0,16,0,16")
-    board.say(b"9,S,0,0,16,0,16")
+    board.receive_frame(b"4,S,0,0,16,0,16")
+    board.receive_frame(b"9,S,0,0,16,0,16")
     insertion = DriveReply(800, moving=False, powered=True, home_switch=True)
     rotation = DriveReply(-250, moving=True, powered=True, inner_switch=True)
     assert board.states == [(7, {"insertion": insertion, "rotation": rotation})]
@@ -70,7 +70,7 @@ def test_orders_and_a_request_have_these_bytes() -> None:
 def test_a_board_with_one_axis_is_stopped_by_its_dead_man() -> None:
     board = Board("insertion")
     board.protocol.request(1)
-    board.say(b"0,S,1,5,17,0,17")
+    board.receive_frame(b"0,S,1,5,17,0,17")
     found = DriveReply(5, moving=False, powered=True, timed_out=True)
     assert board.states == [(1, {"insertion": found})]
 

@@ -40,7 +40,7 @@ class Line(ProtocolBench[ZaberProtocol]):
         self.is_silent = False
         self.commands: list[str] = []
 
-    def say(self, *texts: str) -> None:
+    def receive_lines(self, *texts: str) -> None:
         """Receive replies without their checksum and line end."""
         for text in texts:
             self.receive(f"{text}:{-sum(text[1:].encode()) % 256:02X}\r\n".encode())
@@ -52,7 +52,7 @@ class Line(ProtocolBench[ZaberProtocol]):
             flag = "OK" if answer is not None else "RJ"
             if not self.is_silent:
                 text = f"{flag} IDLE WR {answer or 'BADCOMMAND'}"
-                self.say(f"@{device:>02} {axis} {number:>02} {text}")
+                self.receive_lines(f"@{device:>02} {axis} {number:>02} {text}")
 
     def ready(self) -> Line:
         self.run(self.protocol.identify())
@@ -65,7 +65,7 @@ class Line(ProtocolBench[ZaberProtocol]):
         self.protocol.request(number)
         for device in (1, 2):
             for message_id, data in ((1 + number, "900"), (34 + number, "0")):
-                self.say(f"@{device:02} 1 {message_id:02} OK {status} {flag} {data}")
+                self.receive_lines(f"@{device:02} 1 {message_id:02} OK {status} {flag} {data}")
         assert self.states[-1][0] == number
         return self.state("rotation")
 
@@ -147,7 +147,7 @@ def test_each_request_asks_for_positions_and_one_slow_state() -> None:
 
 
 @pytest.mark.parametrize(("method", "asks"), [(17, True), (37, False)])
-def test_a_rotation_homed_where_it_stands_has_no_switches(method: int, asks: bool) -> None:
+def test_a_rotation_homed_at_its_position_has_no_switches(method: int, asks: bool) -> None:
     line = Line(rotation_homing_method=method)
     line.run(line.protocol.set_up("rotation"))
     assert ("2 1 get limit.home.state" in line.commands) is asks
@@ -190,8 +190,8 @@ def test_warning_flags(flag: str, status: str, powered: bool, fault: str, reboot
 def test_a_restart_shows_behind_a_higher_flag() -> None:
     line = Line().ready()
     line.protocol.request(7)
-    line.say("@01 1 08 OK IDLE WV 900", "@01 1 41 OK IDLE WV 02 WV WR")
-    line.say("@02 1 08 OK IDLE WV 900", "@02 1 41 OK IDLE WV 01 WV")
+    line.receive_lines("@01 1 08 OK IDLE WV 900", "@01 1 41 OK IDLE WV 02 WV WR")
+    line.receive_lines("@02 1 08 OK IDLE WV 900", "@02 1 41 OK IDLE WV 01 WV")
     assert (line.state().rebooted, line.state("rotation").rebooted) == (True, False)
     line.run(line.protocol.clear_fault("insertion"))
     assert line.commands[-1] == "1 1 warnings clear"
@@ -221,16 +221,16 @@ COMPLETE = (
 def test_an_incomplete_or_wrong_answer_is_none(lost: int, instead: bytes) -> None:
     line = Line().ready()
     line.protocol.request(7)
-    line.say(*(text for index, text in enumerate(COMPLETE) if index != lost))
+    line.receive_lines(*(text for index, text in enumerate(COMPLETE) if index != lost))
     line.receive(instead)
     assert line.states == []
-    line.say(COMPLETE[lost])
+    line.receive_lines(COMPLETE[lost])
     assert len(line.states) == 1
 
 
 def test_a_rejected_order_is_a_fault_until_it_is_acknowledged() -> None:
     line = Line().ready()
-    line.say("@02 1 00 RJ IDLE -- BADDATA", "@02 1 00 OK BUSY -- 0")
+    line.receive_lines("@02 1 00 RJ IDLE -- BADDATA", "@02 1 00 OK BUSY -- 0")
     assert line.answered(5).fault == "refused an order: BADDATA"
     assert line.state().fault == ""
     line.run(line.protocol.clear_fault("rotation"))

@@ -99,11 +99,11 @@ def test_blocked_axis_is_released_when_stopped(machine: DriveMachine, behind: in
 @pytest.mark.parametrize(
     ("ways", "off"),
     [
-        # It moves on; it slows down too late; it creeps at the limit of rest.
+        # The drive keeps moving; brakes too late; creeps at the limit of rest.
         ([100] * 20, True),
         ([100] * 9 + [80, 60, 40, 20, 0, 0, 0, 0, 0, 0, 0], True),
         ([2] * 20, False),
-        # It stops on its ramp; its jitter exceeds rest.
+        # The drive stops on its ramp; jitters by more than the limit of rest.
         ([100, 60, 20] + [0] * 17, False),
         ([8, -8] * 10, False),
     ],
@@ -127,7 +127,7 @@ def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> 
     enabled(machine)
     machine.mode = Mode.HOMING
     position = Mode.CYCLIC_SYNCHRONOUS_POSITION
-    # The axis rests since it was enabled.
+    # The axis has been at rest since it was enabled.
     assert machine.next_order() == (DriveCommand.QUICK_STOP, position)
     for answer, order in (
         (state(QUICK_STOP), (DriveCommand.DISABLE_VOLTAGE, position)),
@@ -148,7 +148,7 @@ def test_axis_that_never_rests_is_switched_off(
 ) -> None:
     enabled(machine)
     machine.set_goal(Goal.OFF)
-    # Jitter, which is no motion.
+    # Jitter does not count as motion.
     given = orders(machine, *(state(QUICK_STOP, 8 + 8 * (count % 2)) for count in range(51)))
     assert given == [DriveCommand.QUICK_STOP] * 50 + [DriveCommand.DISABLE_VOLTAGE]
 

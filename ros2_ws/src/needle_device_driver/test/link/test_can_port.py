@@ -94,7 +94,7 @@ class Adapter:
             data += os.read(self.master, 4096)
         return data
 
-    def say(self, data: bytes) -> None:
+    def transmit(self, data: bytes) -> None:
         os.write(self.master, data)
 
     def unplug(self) -> None:
@@ -168,14 +168,14 @@ def test_close_ends_the_thread_and_releases_the_adapter(adapter: Adapter) -> Non
 
 def test_slcan_receives_frames_in_any_pieces(adapter: Adapter) -> None:
     port = Port("slcan", adapter.path)
-    adapter.say(b"\r\rz\rt1812")
-    adapter.say(b"37")
-    adapter.say(b"02\rt1812ABCD\rt18\rnonsense\rt181xZZ\r\x07" + b"?" * 100 + b"\rt1810\r")
-    adapter.say(b"\r\n\r\nt18123702\r\nz\r\n\nt1811aB12F4\r\n\x07")
+    adapter.transmit(b"\r\rz\rt1812")
+    adapter.transmit(b"37")
+    adapter.transmit(b"02\rt1812ABCD\rt18\rnonsense\rt181xZZ\r\x07" + b"?" * 100 + b"\rt1810\r")
+    adapter.transmit(b"\r\n\r\nt18123702\r\nz\r\n\nt1811aB12F4\r\n\x07")
     port.until(lambda: len(port.frames) == 5 and port.refusals == 2)
     assert port.frames == [b"\x37\x02", b"\xab\xcd", b"", b"\x37\x02", b"\xab"]
     assert port.errors == 3
-    adapter.say(b"t1810\r" * 300)
+    adapter.transmit(b"t1810\r" * 300)
     port.until(lambda: len(port.frames) == 305)
     assert port.changes == [""]
 
@@ -190,7 +190,7 @@ def test_slcan_sets_up_a_silent_adapter_again(adapter: Adapter) -> None:
     port.port.step()
     assert adapter.read(b"O\r") == b"\rC\rS4\rO\r"
     port.now = 0.8
-    adapter.say(b"t1810\r")
+    adapter.transmit(b"t1810\r")
     port.until(lambda: port.frames == [b""])
     # Not after a frame arrived.
     port.now = 1.1

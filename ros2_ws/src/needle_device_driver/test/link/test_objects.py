@@ -103,5 +103,5 @@ def test_late_cycles_are_counted() -> None:
     times = CycleTimes()
     for now in (1.0, 1.0299, 1.06, 1.08):
         times.begin(now)
-    assert times.take() == {"late_cycles": "1", "longest_cycle_s": "0.0301"}
-    assert times.take() == {"late_cycles": "1", "longest_cycle_s": "0.0000"}
+    assert times.pop_figures() == {"late_cycles": "1", "longest_cycle_s": "0.0301"}
+    assert times.pop_figures() == {"late_cycles": "1", "longest_cycle_s": "0.0000"}

@@ -81,7 +81,7 @@ def test_serial_passes_bytes_and_reports_an_unplugged_adapter() -> None:
     port.port.close()
 
 
-def test_link_splits_lines_at_any_terminator_and_counts_what_is_none() -> None:
+def test_link_splits_lines_at_any_terminator_and_counts_garbage() -> None:
     link = TextLink("galil", b":?")
     with pytest.raises(LinkError, match="galil is not open"):
         link.send(b"x")

@@ -168,7 +168,7 @@ class DriveBench(SupervisorBench):
         self.go()
 
     def delay_reaction(self, drive: ScriptedDrive, seconds: float) -> None:
-        """Delay the reaction of a drive to a command by some time [s]; then it is off."""
+        """Delay the reaction of a drive to a command by some time [s]; then the drive is off."""
         due = math.inf
 
         def command(word: int) -> None:

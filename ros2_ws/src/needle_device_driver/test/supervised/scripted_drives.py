@@ -56,8 +56,8 @@ class ScriptedDrive:
         self.mode = 0
         # Modes that it accepts by SDO.
         self.modes = {6, 8}
-        # Orders that it ignores; whether it answers to SYNC, and has heartbeats; counts that it
-        # moves at each SYNC by itself, in a state and while it homes.
+        # Orders that the drive ignores; whether it answers to SYNC, and has heartbeats; counts that
+        # it moves at each SYNC without an order, in a state and while it homes.
         self.ignored_orders: set[str] = set()
         self.syncs = self.beats = True
         self.drift: dict[str, int] = {}
@@ -105,7 +105,7 @@ class ScriptedDrive:
     def statusword(self) -> int:
         return self.STATES[self.state] | self.more_status
 
-    def take(self, cob_id: int, data: bytes) -> None:
+    def receive(self, cob_id: int, data: bytes) -> None:
         if cob_id == 0x600 + self.node:
             if self.nmt != 0x04:
                 self.sdo(data)
@@ -263,7 +263,7 @@ class ScriptedBus:
         self.sending()
         self.sent.append((cob_id, data))
         for drive in self.drives:
-            drive.take(cob_id, data)
+            drive.receive(cob_id, data)
         if not self.late:
             self.flush()
 

@@ -59,7 +59,7 @@ class SupervisorBench(abc.ABC):
 
     @property
     def notices(self) -> list[Notice]:
-        self.events += self.supervisor.take_events()
+        self.events += self.supervisor.pop_events()
         return [event for event in self.events if isinstance(event, Notice)]
 
     @property
@@ -70,7 +70,7 @@ class SupervisorBench(abc.ABC):
 
     @property
     def results(self) -> list[tuple[int, str]]:
-        self.events += self.supervisor.take_events()
+        self.events += self.supervisor.pop_events()
         return [(e.stamp_ns, e.outcome) for e in self.events if isinstance(e, CommandResult)]
 
     @property

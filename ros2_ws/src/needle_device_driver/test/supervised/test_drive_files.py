@@ -1,4 +1,4 @@
-"""check_drive on EDS and DCF files: what the set-up would find in such a drive."""
+"""check_drive on EDS and DCF files, as the set-up would read them from the drive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""device_driver as a component, on emulated drives: what the conformance kit leaves out."""
+"""device_driver as a component, on emulated drives: cases not in the conformance kit."""
 
 from __future__ import annotations
 

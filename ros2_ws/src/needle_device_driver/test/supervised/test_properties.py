@@ -23,7 +23,7 @@ def _named(name: str, event: Event) -> Event:
 
 def _homeless(bench: Bench) -> None:
     bench.insertion.homed = False
-    # The supervisor knows only after the next feedback of the axis.
+    # The supervisor is updated by the next feedback of the axis.
     bench.supervisor.observe(bench.now)
 
 

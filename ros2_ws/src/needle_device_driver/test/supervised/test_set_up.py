@@ -97,7 +97,7 @@ REFUSED: list[tuple[Change, str]] = [
     (all_of(reports({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     (refuses(RANGE, 0x605A), "node 1 refuses to write 6 to 0x605A:0"),
     (refuses(RANGE, 0x605E), "node 1 refuses to write 2 to 0x605E:0"),
-    # A method to a switch is never replaced by one where the axis stands.
+    # Homing to a switch is never replaced by homing at the present position.
     (refuses(RANGE, 0x6098, but=b"\x25"), "refuses to write 17 to 0x6098:0"),
     # It happens to have the values for a drive without home.
     (
@@ -106,7 +106,7 @@ REFUSED: list[tuple[Change, str]] = [
     ),
     *(kept(0x607D, wanted, 0) for wanted in (-(2**31), 2**31 - 1)),
     *(kept(index, wanted, 5) for index, wanted in REQUIRED.items()),
-    # Neither in counts nor in rpm.
+    # Units other than counts and rpm.
     in_unit(0x60A9, 0xFD01_0300, "10^-3 m/s"),
     in_unit(0x60A9, 0x0010_0300, "rad/s"),
     in_unit(0x60A9, 0x0041_4700, "deg/min"),
@@ -178,7 +178,7 @@ def units(speed: int, ramp: int, more: Values, per_speed: float, per_ramp: float
 
 
 ASSUMED = "does not report its units; assumed: "
-UNTOLD = f"{ASSUMED}counts/s (0x60A9), counts/s^2 (0x60AA);"
+UNREPORTED_UNITS = f"{ASSUMED}counts/s (0x60A9), counts/s^2 (0x60AA);"
 WIDTHS = {(0x605A, 0): 1, (0x6066, 0): 4, (0x60C2, 1): 2}
 TAKEN: list[Row] = [
     (has(), {(0x6065, 0): 10_000, (0x607D, 1): -20_000, (0x607D, 2): 4_020_000}, ""),
@@ -193,8 +193,8 @@ TAKEN: list[Row] = [
     units(RPM, COUNTS_2, TURN, 20_000 / 60, 1.0),
     units(COUNTS, RPM_S, {**TURN, (0x6096, 1): 60, (0x6096, 2): 1}, 1.0, 20_000 / 60),
     (fed(100_000, 2), {(0x6085, 0): 12_000}, ""),
-    (all_of(reports(TURN), lacks(0x60A8, 0x60A9, 0x60AA)), SPEEDS | RAMPS, UNTOLD),
-    (reports({(0x60A9, 0): 0, (0x60AA, 0): 0}), SPEEDS | RAMPS, UNTOLD),
+    (all_of(reports(TURN), lacks(0x60A8, 0x60A9, 0x60AA)), SPEEDS | RAMPS, UNREPORTED_UNITS),
+    (reports({(0x60A9, 0): 0, (0x60AA, 0): 0}), SPEEDS | RAMPS, UNREPORTED_UNITS),
     (all_of(reports(IN_RPM), lacks(0x60AA)), {(0x6085, 0): 30_000}, f"{ASSUMED}the unit of its sp"),
     (
         all_of(lacks(0x60A9), reports({(0x6096, 1): 7, (0x6096, 2): 7})),

@@ -18,7 +18,7 @@ class NeedleShape:
     """Bevel-tip needle with a pre-bent distal end ([KC09] section II: 0.7 mm, 10 deg at 9 mm).
 
     The bevel force tilts the distal segment by `lean` towards -y of the tip frame, so that the bend
-    lies beside the tip's path; behind the bend, the shaft returns to the path on a parabola.
+    lies off the tip's path; behind the bend, the shaft returns to the path on a parabola.
 
     Parameters
     ----------

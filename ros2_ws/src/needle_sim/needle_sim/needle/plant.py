@@ -256,7 +256,7 @@ class NeedlePlant:
             channel.append(before, twist, length, angle, tip_turned)
 
     def _follow(self, channel: Channel, insertion: float) -> None:
-        """Move the tip along its path, rotated by its rotation since it cut the path there."""
+        """Move the tip along its path; its roll differs by the rotation since the path was cut."""
         path, angle = channel.at(insertion)
         tip_angle = float(self._torsion.tip_angle)
         self._pose = np.asarray(path @ rotation_about_z(tip_angle - angle))

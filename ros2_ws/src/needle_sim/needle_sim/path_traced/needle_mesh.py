@@ -51,7 +51,7 @@ class NeedleMesh:
     parts : dict of str to Mesh
         `shaft`, the outside of the tube; `face`, the bevel; for a hollow needle `bore`, its inside.
     extreme : ndarray, shape (3,)
-        Foremost point of the metal, half a diameter beside the end of the axis, in `rig` [m].
+        Foremost point of the metal, half a diameter off the end of the axis, in `rig` [m].
     face_middle : ndarray, shape (3,)
         Intersection of the axis with the plane of the bevel, in `rig` [m].
     """

@@ -20,7 +20,7 @@ _LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _MIN_LLVM = 17
 _LIBRARY_FOLDERS = ("/usr/lib/x86_64-linux-gnu", "/usr/lib64", "/usr/lib")
 _LIBRARY_NAME = re.compile(r"libLLVM(?:-|\.so\.)(\d+)[\d.]*(?:\.so(?:\.1)?)?")
-_HINT = "docs/dependencies.md says how to install it"
+_HINT = "see docs/dependencies.md"
 
 
 class Mitsuba(NamedTuple):

@@ -56,8 +56,8 @@ exit codes: 0 done; 2 invalid input or a missing file or package; 130 interrupte
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `render_images`; return its exit code."""
-    words = sys.argv[1:] if arguments is None else arguments
-    return run_command(lambda: render_images(_parser().parse_args(words)))
+    argv = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: render_images(_parser().parse_args(argv)))
 
 
 def render_images(given: argparse.Namespace) -> int:

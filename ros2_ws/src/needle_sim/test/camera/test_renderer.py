@@ -140,7 +140,7 @@ def test_the_bend_turns_by_its_angle_and_ends_at_the_tip() -> None:
 def test_a_short_path_draws_only_the_part_inside() -> None:
     plant = needle(0.004, 0.0, 0.0)
     line = NeedleShape().shaft_centreline(plant.T_rig_tip, plant.centreline(0.001), 0.0003)
-    # Up to where the bend is beside the path.
+    # Up to the point where the bend leaves the path.
     assert line[0, 2] == pytest.approx(0.0, abs=5e-5)
     for length in (0.0, 1e-16, 1e-9):
         point = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, length]])

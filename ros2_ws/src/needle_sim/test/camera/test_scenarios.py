@@ -54,7 +54,9 @@ def renderers(rig: StereoRig, request: pytest.FixtureRequest) -> list[StereoRend
     return [StereoRenderer(small(rig), seed, scenario=scenario) for seed in (5, 5, 6)]
 
 
-def test_a_scenario_repeats_whatever_was_rendered_before(renderers: list[StereoRenderer]) -> None:
+def test_a_scenario_repeats_regardless_of_earlier_renderings(
+    renderers: list[StereoRenderer],
+) -> None:
     plant, (one, two, other) = needle(0.08), renderers
     late, early = (render(one, plant, number) for number in (31, 3))
     np.testing.assert_array_equal(early, render(two, plant, 3))

@@ -16,7 +16,7 @@ from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from .scenes import CALIBRATION, TOP_AND_SIDE
 
 
-def test_the_shipped_file_puts_both_cameras_where_its_header_says(rig: StereoRig) -> None:
+def test_the_camera_poses_of_the_shipped_file_match_its_header(rig: StereoRig) -> None:
     assert rig.half_height == 0.0175
     for camera, y in ((rig.left, -0.1), (rig.right, 0.1)):
         window = camera.window

@@ -129,7 +129,7 @@ def test_process_data_flow_in_operational_only_and_a_stopped_drive_answers_nothi
         master.read(0x1000)
 
 
-def test_a_heartbeat_comes_at_its_period_with_the_state(master: Master) -> None:
+def test_a_heartbeat_is_sent_at_its_period_with_the_state(master: Master) -> None:
     master.write(0x1017, 0, 30, 2)
     master.received.clear()
     master.wait(0.3)

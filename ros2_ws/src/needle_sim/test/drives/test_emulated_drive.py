@@ -37,7 +37,7 @@ def run_at(master: Master, counts_per_sync: int) -> int:
 # ---- the power state ---------------------------------------------------------------------------
 
 
-def test_the_power_state_goes_where_the_standard_says() -> None:
+def test_the_power_state_follows_the_standard() -> None:
     for state in PowerState:
         assert tuple(next_state(state, word).value for word in WORDS) == WAYS[state.value]
 
@@ -128,7 +128,7 @@ def test_the_next_profile_target_waits_for_the_first_and_a_relative_one_adds(
 @pytest.mark.parametrize("start", [2_345.5, -1.0, -5_000.0])
 def test_homing_finds_the_edge_of_the_switch(start: float) -> None:
     master = Master(start=start)
-    # It counts from its position at power-up.
+    # The drive counts from its position at power-up.
     assert master.read(0x6064) == 0
     master.home()
     # It rests a braking distance off the edge and counts from the edge.
@@ -219,7 +219,7 @@ def test_switching_off_brakes_first(
     assert master.read(0x6064) - before == pytest.approx(1600, abs=1)
 
 
-def test_halt_stops_and_its_release_goes_on(master: Master) -> None:
+def test_halt_stops_and_its_release_resumes(master: Master) -> None:
     master.enable(PP)
     master.target(10_000)
     master.control(0x1F)

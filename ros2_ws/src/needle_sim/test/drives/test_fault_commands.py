@@ -60,7 +60,7 @@ def test_the_adapter_is_unplugged_and_plugged_in_on_command(drives: DriveEmulato
     assert {action.port for action in actions if isinstance(action, Send)} == {ADAPTERS}
 
 
-def test_lines_that_are_no_commands_are_named_and_do_nothing(drives: DriveEmulator) -> None:
+def test_invalid_command_lines_are_reported_and_ignored(drives: DriveEmulator) -> None:
     bad = (
         *("explode", "stall", "stall both", "stall insertion now", "cut_bus now"),
         *("emcy insertion x", "emcy rotation 0x10000"),

@@ -47,7 +47,7 @@ def test_stock_slcan_exchanges_frames_through_the_port(port: PtyCan) -> None:
     ]
 
 
-def test_an_unplugged_adapter_is_an_error_and_comes_back(port: PtyCan) -> None:
+def test_an_unplugged_adapter_is_an_error_and_reconnects(port: PtyCan) -> None:
     link = Path(port.path)
     bus = computer(port)
     port.plug(plugged_in=False)

@@ -15,7 +15,7 @@ def adapter() -> SlcanAdapter:
     return adapter
 
 
-def test_frames_are_taken_whole_or_byte_by_byte(adapter: SlcanAdapter) -> None:
+def test_frames_are_received_whole_or_byte_by_byte(adapter: SlcanAdapter) -> None:
     for command, frame in (
         (b"t0800\r", CanFrame(0x080)),
         (b"t20130F0008\r", CanFrame(0x201, b"\x0f\x00\x08")),

@@ -152,8 +152,8 @@ def test_orders_need_power_and_power_needs_a_set_up() -> None:
 def test_the_sketch_answers_as_the_emulated_board(tmp_path: Path) -> None:
     bench = tmp_path / "bench"
     sketch = f'-DSKETCH="{SKETCH}"'
-    words = ["g++", "-O0", "-Wall", "-Wextra", "-Werror", sketch, str(ARDUINO / "bench.cpp")]
-    subprocess.run([*words, "-o", str(bench)], check=True)
+    argv = ["g++", "-O0", "-Wall", "-Wextra", "-Werror", sketch, str(ARDUINO / "bench.cpp")]
+    subprocess.run([*argv, "-o", str(bench)], check=True)
     computer = Computer()
     script: list[str] = []
     emulated: list[str] = []

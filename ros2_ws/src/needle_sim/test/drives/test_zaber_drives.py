@@ -15,7 +15,7 @@ SPEED, RAMP = 32768, 82
 
 
 class Chain:
-    """A computer on a chain whose insertion device stands 1 mm from its home sensor."""
+    """A computer on a chain whose insertion device is 1 mm from its home sensor."""
 
     def __init__(self, **motor: float) -> None:
         insertion = MotorSettings(
@@ -25,20 +25,20 @@ class Chain:
         self.drives = ZaberDrives(motors, -1.0)
         self.now = 0.0
 
-    def say(self, line: str, after: float = 0.0) -> str:
+    def send(self, line: str, after: float = 0.0) -> str:
         self.now += after
         sent = f"/{line}\n".encode()
         return b"".join(self.drives.receive((sent,), self.now)).decode()
 
     def value(self, name: str, after: float = 0.0) -> float:
-        return float(self.say(f"1 1 get {name}", after).split()[-1])
+        return float(self.send(f"1 1 get {name}", after).split()[-1])
 
     def homed(self) -> Chain:
-        self.say("1 set maxspeed 32768")
-        self.say(f"1 set accel {RAMP}")
-        self.say("1 home")
+        self.send("1 set maxspeed 32768")
+        self.send(f"1 set accel {RAMP}")
+        self.send("1 home")
         self.now += 1.0
-        assert "WR" not in self.say("1 warnings")
+        assert "WR" not in self.send("1 warnings")
         return self
 
     @property
@@ -71,17 +71,17 @@ def test_the_transcript_of_public_code() -> None:
         (0.0, "1 set comm.checksum 1", "@01 0 OK IDLE -- 0:8D"),
         (0.0, "1 0 12:FC", "@01 0 12 OK IDLE -- 0:0A"),
     ):
-        assert chain.say(sent, after) == f"{expected}\r\n", sent
+        assert chain.send(sent, after) == f"{expected}\r\n", sent
 
 
 @pytest.mark.parametrize("line", ["1 0 12:FD", "3 get pos"])
 def test_a_wrong_checksum_and_another_address_have_no_answer(line: str) -> None:
-    assert Chain().say(line) == ""
+    assert Chain().send(line) == ""
 
 
 def test_speed_and_ramp_have_the_protocols_units() -> None:
     chain = Chain().homed()
-    chain.say(f"1 1 move abs 50000 {SPEED // 2}")
+    chain.send(f"1 1 move abs 50000 {SPEED // 2}")
     assert chain.drives.axes(chain.now + 0.015)["insertion"].velocity == pytest.approx(
         0.0075, abs=0.0006
     )
@@ -92,63 +92,63 @@ def test_speed_and_ramp_have_the_protocols_units() -> None:
 def test_without_a_reference_no_outward_motion_is_accepted() -> None:
     chain = Chain()
     assert chain.value("pos") == TRAVEL * SCALE
-    assert chain.say("1 1 move rel 1") == "@01 1 RJ IDLE WR BADDATA\r\n"
-    assert " OK BUSY WR" in chain.say("1 1 move rel -10")
-    chain.say("1 1 set pos 0", 0.1)
-    assert chain.say("1 1 move rel 1") == "@01 1 OK BUSY WH 0\r\n"
+    assert chain.send("1 1 move rel 1") == "@01 1 RJ IDLE WR BADDATA\r\n"
+    assert " OK BUSY WR" in chain.send("1 1 move rel -10")
+    chain.send("1 1 set pos 0", 0.1)
+    assert chain.send("1 1 move rel 1") == "@01 1 OK BUSY WH 0\r\n"
 
 
 def test_a_limit_sensor_ends_a_move() -> None:
     chain = Chain().homed()
-    chain.say("1 set limit.min -9000")
-    chain.say("1 1 move abs -5000")
-    assert chain.say("1 1", 1.0) == "@01 1 OK IDLE WL 0\r\n"
+    chain.send("1 set limit.min -9000")
+    chain.send("1 1 move abs -5000")
+    assert chain.send("1 1", 1.0) == "@01 1 OK IDLE WL 0\r\n"
     assert chain.value("limit.home.state") == 1
     assert chain.value("limit.away.state") == 0
     assert abs(chain.place) < 1e-3
-    chain.say("1 1 move abs 5000")
+    chain.send("1 1 move abs 5000")
     assert chain.value("pos", 1.0) == 5000
     assert chain.value("limit.home.state") == 0
-    assert "01 WL" in chain.say("1 warnings clear")
-    assert chain.say("1 warnings") == "@01 0 OK IDLE -- 00\r\n"
+    assert "01 WL" in chain.send("1 warnings clear")
+    assert chain.send("1 warnings") == "@01 0 OK IDLE -- 00\r\n"
 
 
 def test_a_stall_is_measured_and_acknowledged() -> None:
     chain = Chain().homed()
-    chain.say("1 1 move abs 50000")
+    chain.send("1 1 move abs 50000")
     chain.now += 0.5
     blocked = chain.place
     chain.drives.stall("insertion")
-    assert chain.say("1 1", 0.3) == "@01 1 OK IDLE FS 0\r\n"
+    assert chain.send("1 1", 0.3) == "@01 1 OK IDLE FS 0\r\n"
     assert chain.value("pos") == chain.value("encoder.pos") == round(chain.place * SCALE)
     assert chain.place == pytest.approx(blocked)
     chain.drives.restore(chain.now)
-    assert chain.say("1 1 move abs 0") == "@01 1 OK BUSY FS 0\r\n"
-    chain.say("1 warnings clear", 3.0)
-    assert chain.say("1 1 get pos") == "@01 1 OK IDLE -- 0\r\n"
+    assert chain.send("1 1 move abs 0") == "@01 1 OK BUSY FS 0\r\n"
+    chain.send("1 warnings clear", 3.0)
+    assert chain.send("1 1 get pos") == "@01 1 OK IDLE -- 0\r\n"
 
 
 def test_a_device_without_encoder_does_not_notice_a_stall() -> None:
     chain = Chain().homed()
     chain.drives.drives["insertion"].has_encoder = False
     chain.drives.stall("insertion")
-    chain.say("1 1 move abs 5000")
+    chain.send("1 1 move abs 5000")
     assert chain.value("pos", 1.0) == 5000
     assert abs(chain.place) < 1e-3
-    assert "RJ" in chain.say("1 1 get encoder.pos")
+    assert "RJ" in chain.send("1 1 get encoder.pos")
 
 
 def test_a_loss_of_power_loses_the_reference_but_no_setting() -> None:
     chain = Chain().homed()
-    chain.say("1 1 move abs 50000")
+    chain.send("1 1 move abs 50000")
     chain.now += 0.5
     chain.drives.reboot("insertion", chain.now)
     place = chain.place
-    assert chain.say("get pos", 0.1).startswith("@02 0")
-    assert chain.say("1 1 get maxspeed", 0.4) == "@01 1 OK IDLE WR 32768\r\n"
+    assert chain.send("get pos", 0.1).startswith("@02 0")
+    assert chain.send("1 1 get maxspeed", 0.4) == "@01 1 OK IDLE WR 32768\r\n"
     assert chain.place == place
     assert chain.value("pos") == TRAVEL * SCALE
-    assert "WR" in chain.say("2 warnings")
+    assert "WR" in chain.send("2 warnings")
 
 
 def test_a_device_alone_keeps_its_address() -> None:

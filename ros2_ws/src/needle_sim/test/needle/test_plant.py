@@ -108,7 +108,7 @@ def test_retraction_follows_the_path_back_and_undone_rotation_restores_the_pose(
     plant, undone = wandering(), wandering()
     for pose, turned in zip(poses[::-1], TURNS[::-1], strict=True):
         plant.advance(-0.001, 0.0)
-        # Position and heading are those of the path; the tip is not turned back, nor is the base.
+        # Position and heading are those of the path; neither tip nor base is turned back.
         np.testing.assert_allclose(plant.T_rig_tip[:3, 2:], pose[:3, 2:], rtol=0, atol=1e-13)
         undone.advance(-0.001, -turned)
         np.testing.assert_allclose(undone.T_rig_tip, pose, rtol=0, atol=1e-13)

@@ -77,7 +77,7 @@ def test_a_box_is_seen_through_walls_that_end(boxes: list[StereoRig]) -> None:
         assert inside[:, 2].min() > 0.0
         # The walls are slightly out of square.
         assert np.abs(inside @ other.window.normal).max() < other.window.inner + 1e-3
-        # A line of sight beside the walls continues straight from the camera.
+        # A line of sight that misses the walls continues straight from the camera.
         beside = rays.origin[rays.in_air] - camera.centre
         away = np.cross(beside, rays.direction[rays.in_air])
         assert np.abs(away).max(initial=0.0) < 1e-12
@@ -101,7 +101,7 @@ def test_the_mesh_has_its_diameter_and_its_end(hollow: bool) -> None:
     needle = needle_mesh(line, aside, look)
     heading = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
     assert look.bevel_length == pytest.approx(0.0012124, abs=1e-7)
-    # Beside the end of the axis, on the side of the bend, and level with it.
+    # Next to the end of the axis, on the side of the bend, and level with it.
     away = needle.extreme - line[-1]
     assert np.linalg.norm(away) == pytest.approx(0.00035, abs=1e-8)
     assert abs(away @ heading) < 1e-6

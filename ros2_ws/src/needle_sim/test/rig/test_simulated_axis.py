@@ -33,7 +33,7 @@ def test_an_axis_reaches_its_target_exactly_and_in_time_both_ways() -> None:
         assert (axis.poll(0.0).velocity, axis.poll(0.0).moving) == (0.0, False)
 
 
-def test_an_axis_that_is_off_stopped_or_at_fault_stands_still() -> None:
+def test_an_axis_that_is_off_stopped_or_at_fault_does_not_move() -> None:
     axis = SimulatedAxis("insertion")
     with pytest.raises(AxisError, match="insertion axis cannot move: not powered"):
         axis.start_move(1.0, 1.0)

@@ -39,8 +39,8 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_the_folder_contains_the_rendered_images(tmp_path: Path) -> None:
     output, done = tmp_path / "new" / "images", tmp_path / "done.json"
-    words = ["--scenario", "clean", "--frames", "2", "--seed", "7", "--step-mm", "9"]
-    assert main(arguments(output, *words, "--json", str(done))) == 0
+    argv = ["--scenario", "clean", "--frames", "2", "--seed", "7", "--step-mm", "9"]
+    assert main(arguments(output, *argv, "--json", str(done))) == 0
     rig, clean = load_stereo_rig(CALIBRATION), SCENARIOS["clean"]
     outside, inside = render_insertion(rig, clean, seed=7, frames=2, step=0.009)
     insertions, truths = rows(output / "insertion.csv"), rows(output / "truth.csv")
@@ -64,8 +64,8 @@ def test_the_folder_contains_the_rendered_images(tmp_path: Path) -> None:
 def test_without_a_needle_there_is_no_truth_and_the_first_frame_may_be_deep_in(
     tmp_path: Path,
 ) -> None:
-    words = ["--scenario", "absent", "--start-mm", "50", "--depth-mm", "52", "--frames", "1"]
-    assert main(arguments(tmp_path / "a", *words)) == 0
+    argv = ["--scenario", "absent", "--start-mm", "50", "--depth-mm", "52", "--frames", "1"]
+    assert main(arguments(tmp_path / "a", *argv)) == 0
     (row,) = rows(tmp_path / "a" / "insertion.csv")
     assert row["insertion_m"] == "0.05"
     (row,) = rows(tmp_path / "a" / "truth.csv")
@@ -117,7 +117,7 @@ def test_angles_of_the_truth_give_the_directions_back() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "named"),
+    ("argv", "named"),
     [
         (["--scenario", "fog"], "scenario 'fog' is not one of clean"),
         (["--frames", "0"], "--frames = 0 is outside [1, 999999]"),
@@ -140,11 +140,11 @@ def test_a_bad_argument_is_one_line_and_writes_nothing(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-    words: list[str],
+    argv: list[str],
     named: str,
 ) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    assert main(arguments(tmp_path / "out", *words)) == 2
+    assert main(arguments(tmp_path / "out", *argv)) == 2
     error = capsys.readouterr().err
     assert named in error
     assert error.count("\n") == 1

@@ -125,7 +125,7 @@ def test_a_bias_walks_by_tenths_within_its_bounds_and_stays_spread_evenly() -> N
     steps = np.diff(bias, axis=0)
     inside = np.abs(bias[:-1]) < 0.0009
     np.testing.assert_allclose(np.abs(steps[inside]), 0.0001, atol=1e-12)
-    # Up and down equally often, whatever the previous step.
+    # Up and down equally often, independent of the previous step.
     assert abs(np.mean(steps > 0.0) - 0.5) < 0.01
     assert abs(np.corrcoef(steps[0].ravel(), steps[1].ravel())[0, 1]) < FIVE + 0.1
     # Each needle has its own, wherever a part begins.

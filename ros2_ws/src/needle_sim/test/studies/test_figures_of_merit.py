@@ -75,7 +75,7 @@ def test_distant_ends_with_high_confidence_are_counted_on_both_sides() -> None:
     assert undoubted_misses(distance, np.full(5, np.nan)) is None
 
 
-def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:
+def test_shares_within_2_and_3_sigma_count_x_and_pitch_equally() -> None:
     # Errors of 1, 2.5 and 4 standard deviations in x; of 0, 0 and 2.5 in sin(pitch).
     tally = ConsistencyTally(3)
     truth = np.array([0.001, 0.0025, 0.004]), np.arcsin([0.0, 0.0, 0.025])

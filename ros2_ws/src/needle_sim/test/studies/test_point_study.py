@@ -121,7 +121,7 @@ def test_each_needle_ends_at_its_own_point_with_a_short_last_step() -> None:
     assert seen["max_point_mm"] == pytest.approx(2.0, abs=1e-3)
     apart = run_point_study(np.zeros((2, 3)), targets, Straight, STRAIGHT, chunk=1)
     np.testing.assert_allclose(apart.error, found.error, atol=1e-9)
-    # No needle goes beyond the depth.
+    # No needle is inserted beyond the depth.
     shallow = dataclasses.replace(STRAIGHT, depth=0.0155)
     found = run_point_study(np.zeros((2, 3)), targets, Straight, shallow)
     assert found.error[1] == pytest.approx(np.hypot(0.002, 0.0048), abs=1e-6)

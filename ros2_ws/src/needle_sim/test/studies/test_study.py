@@ -19,7 +19,7 @@ BOUNDS = StartBounds(*LARGEST)
 STARTS = GRIDS["random"](BOUNDS, 1, 4)[:20]
 # Rolled by 90 deg, a needle bends within one plane.
 LEVEL = np.array([[0.0, 0.0, np.deg2rad(90.0)]])
-TROUBLE = Disturbances(
+DISTURBED = Disturbances(
     noise=0.001,
     outliers=0.1,
     found=0.8,
@@ -177,14 +177,14 @@ def test_the_roll_drifts_by_the_root_of_the_insertion_and_a_bias_is_only_measure
 
 
 def test_outcomes_follow_the_seed_and_not_the_chunks() -> None:
-    disturbed = settings(disturbances=TROUBLE, depth=0.021)
+    disturbed = settings(disturbances=DISTURBED, depth=0.021)
 
     def values(study: StudySettings = disturbed, chunk: int = 500) -> FloatArray:
         found = run_study(STARTS, controller_factory("best", 0.001), study, chunk=chunk)
         return np.column_stack([found.x_last, found.settled, found.rotation])
 
     whole = values()
-    # How a sum is vectorised may depend on the number of needles: the last digits only.
+    # Vectorised sums depend on the number of needles in the last digits.
     np.testing.assert_allclose(values(chunk=7), whole, atol=1e-9)
     assert not np.any(values(dataclasses.replace(disturbed, seed=2))[:, 0] == whole[:, 0])
 

@@ -58,7 +58,7 @@ def test_link_loss_while_idle_and_before_the_set_up() -> None:
         bench.link.send(0x80)
 
 
-# ---- answers that do not come, or late ----------------------------------------------------------
+# ---- missing and late answers -------------------------------------------------------------------
 
 
 def test_reply_age_heartbeats_renew_only_answered_positions() -> None:
@@ -71,7 +71,7 @@ def test_reply_age_heartbeats_renew_only_answered_positions() -> None:
     bench.insertion.syncs = False
     bench.wait(8)
     assert (bench.state, bench.rule) == ("FAULT", "reply_age")
-    # Heartbeats in another state than operational do not count.
+    # Heartbeats in any state but operational do not count.
     bench = DriveBench().configured()
     bench.insertion.nmt = 0x7F
     bench.now += 0.2
@@ -95,18 +95,18 @@ def test_reply_age_includes_late_answers(
 ) -> None:
     bench = DriveBench().ready()
     drive, at, worst, most = bench.insertion, 0, 0.0, 0
-    take, sync = drive.take, drive.sync
+    receive, sync = drive.receive, drive.sync
 
     def without_heartbeats(cob_id: int, data: bytes) -> None:
         # A heartbeat does not replace an answer.
-        drive.emit(0x700, bytes([drive.nmt])) if cob_id == 0x77F else take(cob_id, data)
+        drive.emit(0x700, bytes([drive.nmt])) if cob_id == 0x77F else receive(cob_id, data)
 
     def noted() -> None:
         nonlocal at
         at = drive.position
         sync()
 
-    drive.take, drive.sync = without_heartbeats, noted  # type: ignore[method-assign]
+    drive.receive, drive.sync = without_heartbeats, noted  # type: ignore[method-assign]
     for number in range(cycles):
         drive.answers_late = late(number)
         most = max(most, drive.answers_late)
@@ -156,7 +156,7 @@ def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
     assert bench.drives.health("").message == "connected"
 
 
-# ---- a drive that starts anew -------------------------------------------------------------------
+# ---- a drive that restarts ----------------------------------------------------------------------
 
 
 def test_drive_reboot_of_a_self_starting_drive_needs_a_new_set_up() -> None:

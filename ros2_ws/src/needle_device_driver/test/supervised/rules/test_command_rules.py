@@ -166,7 +166,7 @@ def test_tip_age_is_independent_of_ros_time() -> None:
     assert bench.state == "MOVING"
 
 
-def test_tip_age_while_ros_time_stands_still() -> None:
+def test_tip_age_while_ros_time_is_paused() -> None:
     bench = Bench().ready()
     # Longer than the horizon, and more cycles than are kept.
     for _ in range(1500):

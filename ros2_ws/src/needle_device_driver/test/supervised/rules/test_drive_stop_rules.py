@@ -173,7 +173,7 @@ def test_drive_watchdog_trip_is_named_also_before_the_set_up() -> None:
     assert bench.reset().success
     bench.wait(3)
     assert bench.state == "DISABLED"
-    # An error from before the set-up that is over does not count.
+    # A cleared error from before the set-up does not count.
     bench = DriveBench()
     bench.insertion.emit(0x80, bytes.fromhex("0573000000000000"))
     bench.configured()

@@ -170,7 +170,7 @@ def test_hold_one_owner_until_released() -> None:
     bench = enabled()
     assert send_holds(bench, "a+ b+") == "a a"
     assert bench.rule == "hold_one_owner"
-    # A press beside the owner does not count later; one after an own release does.
+    # A press during another source's hold never counts; a press after its own release does.
     assert send_holds(bench, "b+ a- b+ b- b+") == "a - - - b"
 
 
@@ -271,7 +271,7 @@ def test_hold_in_order_remembers_sixteen_sessions_per_source() -> None:
     assert send_holds(bench, "a/t16#1- a/s#1- a/s#2+ b/s#1- b/t#1- a/s#3+") == "- - a a a a"
 
 
-# ---- what a reset accepts again -----------------------------------------------------------------
+# ---- holds accepted after a reset ---------------------------------------------------------------
 
 
 def test_hold_in_order_reset_accepts_lower_stamps_without_session() -> None:

@@ -41,7 +41,7 @@ def test_coordinated_path_replaces_another_without_a_stop() -> None:
     first = path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.3))
     bench.go(4)
     here = bench.positions[0] * 1e3
-    # It begins behind the needle: the rest of its first leg takes its share of time.
+    # It begins behind the needle: the rest of its first leg takes proportionally less time.
     second = path(bench, (0.1, 0.0), (1.1, -0.2), (here + 2.0, -0.2))
     before = bench.positions
     bench.go()
@@ -137,7 +137,7 @@ def test_max_step_length_bounds_the_end_of_a_path() -> None:
     bench = Bench().ready()
     path(bench, (0.0, 0.0), (1.0, 0.0), (2.0011, 0.0))
     bench.refused("max_step_length")
-    # The axes may rest beside their set-points by the tolerance.
+    # The axes may rest anywhere within the tolerance of their set-points.
     path(bench, (0.001, 0.0), (1.001, 0.0), (2.001, 0.0))
     assert bench.state == "MOVING"
 

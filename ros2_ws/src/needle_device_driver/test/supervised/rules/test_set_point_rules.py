@@ -91,7 +91,7 @@ def test_following_error_of_a_motor_released_after_the_stop() -> None:
     at = bench.positions
     bench.insertion.blocked = False
     bench.wait(10)
-    assert bench.positions == at, "nobody holds"
+    assert bench.positions == at, "there is no hold"
     bench.hold()
     bench.steps()
 
