@@ -179,7 +179,7 @@ def measure(make: Callable[[str], Client], cycles: int) -> tuple[list[float], fl
         channel = Path(folder) / "can"
         with subprocess.Popen(
             [sys.executable, __file__, str(channel)],
-            env={**os.environ},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
