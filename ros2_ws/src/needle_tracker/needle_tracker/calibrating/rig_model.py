@@ -163,8 +163,9 @@ class RigModel:
         corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side])
         corners = (1.0 + parameters[SQUARES]) * corners + boards[:, :3, 3]
         camera, under = self._camera(parameters, side), self._under[side]
-        pixels = RefractedCamera(_in_air(camera)).project(corners)
+        pixels = np.empty((len(corners), 2))
         pixels[under] = RefractedCamera(camera).project(corners[under])
+        pixels[~under] = RefractedCamera(_in_air(camera)).project(corners[~under])
         return pixels
 
     def jacobian(self, parameters: Array, free: Mask) -> Array:

@@ -7,6 +7,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
@@ -14,7 +15,8 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 
-class EndFitSettings(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class EndFitSettings:
     """Constants of the fit; lengths are in needle widths.
 
     Attributes
@@ -127,7 +129,7 @@ def fit_end(
         return None
     line = fitted.line
     end, spread = _end_on_line(ends, axes, line, along, width)
-    norm, offset = math.hypot(1.0, line.slope), float(line.at(np.float64(end)))
+    norm, offset = math.hypot(1.0, line.slope), float(line.at(end))
     middle = axes.point + end * axes.direction + offset * axes.across
     return ImageEnd(
         middle,
@@ -177,9 +179,9 @@ class Line(NamedTuple):
     offset: float
     slope: float
 
-    def at(self, along: Array) -> Array:
+    def at(self, along: npt.ArrayLike) -> Array:
         """Return the distances across at distances along [px]."""
-        return np.asarray(self.offset + self.slope * along)
+        return np.asarray(self.offset + self.slope * np.asarray(along, np.float64))
 
 
 class LineFit(NamedTuple):
