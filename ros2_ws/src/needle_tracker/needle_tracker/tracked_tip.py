@@ -88,7 +88,7 @@ class TrackedTipParameters:
     )
 
     def __post_init__(self) -> None:
-        """Check the fields; raises UserError as `check_fields`."""
+        """Check the fields; a field out of its bounds is a `UserError`."""
         check_fields(self)
 
 

@@ -11,7 +11,7 @@ from needle_tracker.answers.pair_answers import SUSPICION, PairAnswers
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.sources.pairing import OTHER_SIDE, PairMatcher
 
-TROUBLE_SHOWN = 5.0  # duration of a warning after its cause [s]
+WARNING_DURATION = 5.0  # duration of a warning after its cause [s]
 CLOCKS_DIFFER = 1_000_000_000  # lead of a pair over the first joint state that is a fault [ns]
 PARTNER_LATE = 0.5  # delay before an image without a partner is reported [s]
 _RATE_WINDOW = 5.0  # [s]
@@ -126,7 +126,7 @@ class Health:
         return Diagnostic(level, message, values)
 
     def _images_level(self, now: float, answers: PairAnswers) -> tuple[Level, str]:
-        if self.last_refusal is not None and now - self.last_refusal[0] <= TROUBLE_SHOWN:
+        if self.last_refusal is not None and now - self.last_refusal[0] <= WARNING_DURATION:
             return Level.ERROR, f"pair refused: {self.last_refusal[1]}"
         for problem in answers.camera_info.values():
             if problem.text:
@@ -140,7 +140,7 @@ class Health:
             last = self._last_image.get(other, self._first_image)
             if matcher.waiting(side) and now - last > PARTNER_LATE:
                 return Level.WARN, f"{side} images without {other}"
-        if self._last_unpaired is not None and now - self._last_unpaired <= TROUBLE_SHOWN:
+        if self._last_unpaired is not None and now - self._last_unpaired <= WARNING_DURATION:
             return Level.WARN, "images without a partner were dropped"
         if not self._last_image:
             return Level.WARN, "no images yet"

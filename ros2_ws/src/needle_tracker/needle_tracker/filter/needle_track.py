@@ -3,7 +3,7 @@
 The tip of the needle advances along its heading by the travel of the stage, or by an unknown
 distance if the insertion is unknown; the heading turns by at most the curvature of the needle. The
 zero and the scale of the stage are part of the state, so that a stage position that is wrong by 1
-mm does not move the tip. Anything else (an old track, a scratch, a screw) stands still, or its end
+mm does not move the tip. Anything else (an old track, a scratch, a screw) is at rest, or its end
 moves at random.
 """
 
@@ -161,7 +161,7 @@ class NeedleTrack:
     motion : NeedleMotion
         State if it is the needle.
     rest_position, rest_covariance : ndarray, shape (3,) and (3, 3)
-        Position if it stands still [m], and its covariance [m^2].
+        Position if it is at rest [m], and its covariance [m^2].
     recent_evidence : float
         Mean log-odds that it is an end, from the sightings of about the last
         `FilterSettings.evidence_length`.
@@ -275,7 +275,7 @@ class NeedleTrack:
         )
 
     def _surprise_at_rest(self, tip: SpatialTip) -> tuple[float, float]:
-        """Return squared distance and log-density of a sighting if this stands still."""
+        """Return squared distance and log-density of a sighting if this object is at rest."""
         return gaussian(tip.position - self.rest_position, self.rest_covariance + tip.covariance)
 
     def _motion_to(self, tip: SpatialTip, settings: StereoTrackerParameters) -> NeedleMotion:

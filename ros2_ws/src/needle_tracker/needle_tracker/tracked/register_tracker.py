@@ -89,7 +89,7 @@ def register(names: list[str], rig: Array, tracker: Array) -> tuple[Registration
     worst = float(np.max(left_out, initial=0.0))
     if found.error > LARGEST_ERROR or worst > LARGEST_TARGET_ERROR:
         raise UserError(
-            f"{_mistake(names, rig, tracker, fits)}: fiducial error {_mm(found.error)}, limit "
+            f"{_likely_cause(names, rig, tracker, fits)}: fiducial error {_mm(found.error)}, limit "
             f"{_mm(LARGEST_ERROR)}; error at a point left out {_mm(worst)}, limit "
             f"{_mm(LARGEST_TARGET_ERROR)}"
         )
@@ -157,7 +157,7 @@ def _check_layout(names: list[str], rig: Array, tracker: Array) -> None:
             )
 
 
-def _mistake(names: list[str], rig: Array, tracker: Array, fits: dict[int, Fit]) -> str:
+def _likely_cause(names: list[str], rig: Array, tracker: Array, fits: dict[int, Fit]) -> str:
     """Return the mistake without which the points fit."""
     ratio = np.linalg.norm(tracker - tracker.mean(0)) / np.linalg.norm(rig - rig.mean(0))
     mistakes = {

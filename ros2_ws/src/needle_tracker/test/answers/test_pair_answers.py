@@ -166,7 +166,7 @@ def test_four_agreeing_pairs_after_five_misses_raise_a_suspicion_until_a_tip(
     assert looks == [(3, False), (4, True), (4, True), (4, True), (4, False), (4, False)]
 
 
-def test_half_of_the_pairs_are_checked_while_swapped_pairs_show_no_needle(
+def test_every_second_pair_is_checked_for_swapped_sides_while_no_needle_is_found(
     watch: SwapWatch, other: Other
 ) -> None:
     other.finds = False

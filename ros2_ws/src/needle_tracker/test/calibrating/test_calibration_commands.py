@@ -34,7 +34,7 @@ def arguments(tmp_path: Path) -> list[str]:
 
 
 @pytest.fixture
-def seen(
+def found_views(
     views: list[BoardView], result: RigCalibration, monkeypatch: Patch
 ) -> dict[str, list[BoardView]]:
     """Views that both commands find in the images, and those used for the calibration."""
@@ -60,7 +60,7 @@ def one_line(out: Out) -> str:
 
 
 def test_a_written_calibration_passes_its_check(
-    seen: dict[str, list[BoardView]], arguments: list[str], tmp_path: Path, capsys: Out
+    found_views: dict[str, list[BoardView]], arguments: list[str], tmp_path: Path, capsys: Out
 ) -> None:
     output, figures = tmp_path / "rig.yaml", tmp_path / "figures.json"
     assert calibrate_stereo([*arguments, "--output", str(output), "--json", str(figures)]) == 0
@@ -73,7 +73,9 @@ def test_a_written_calibration_passes_its_check(
         assert line in text
     # Views in which neither camera sees the board are left out.
     assert "left out, no board found: blurred" in text
-    assert [view.name for view in seen["used"]] == [view.name for view in seen["views"][:-1]]
+    assert [view.name for view in found_views["used"]] == [
+        view.name for view in found_views["views"][:-1]
+    ]
     assert load_calibration(output).left.window.inside == pytest.approx(1.3, abs=0.003)
     assert output.read_text().startswith("# views: 6 free, 2 surface, 3 under")
     assert (tmp_path / "rig.rig.png").exists()
@@ -84,7 +86,9 @@ def test_a_written_calibration_passes_its_check(
     assert values["surface_height_mm"] == pytest.approx(17.5, abs=0.3)
     assert values["problem"] is None
 
-    seen["views"] = [view for view in seen["views"] if view.name in ("surface_a", "under_wedge")]
+    found_views["views"] = [
+        view for view in found_views["views"] if view.name in ("surface_a", "under_wedge")
+    ]
     words = [*arguments, "--calibration", str(output), "--json", str(figures)]
     assert check_calibration(words) == 0
     assert capsys.readouterr().out.endswith("OK\n")
@@ -101,7 +105,7 @@ def test_a_written_calibration_passes_its_check(
 
 
 def test_contradictions_are_in_text_json_and_exit_code(
-    seen: dict[str, list[BoardView]],
+    found_views: dict[str, list[BoardView]],
     arguments: list[str],
     tmp_path: Path,
     capsys: Out,
@@ -130,7 +134,7 @@ def test_contradictions_are_in_text_json_and_exit_code(
 
 
 def test_bad_arguments_are_reported_in_one_line_with_exit_2(
-    seen: dict[str, list[BoardView]],
+    found_views: dict[str, list[BoardView]],
     arguments: list[str],
     tmp_path: Path,
     calibration_path: Path,

@@ -30,7 +30,7 @@ def maps(
 def fitted(
     drawn: tuple[np.ndarray, np.ndarray], angle: float, across: float = 4.0
 ) -> ImageEnd | None:
-    """Fit from a position 3 px and a direction 0.03 rad beside the truth."""
+    """Fit from a position that is 3 px off and a direction that is 0.03 rad off."""
     direction = np.array([math.cos(angle + 0.03), math.sin(angle + 0.03)])
     place = END + np.array([3.0, 0.0])
     return fit_end(
@@ -68,7 +68,7 @@ def test_an_end_that_the_map_does_not_show_may_be_anywhere_in_the_window() -> No
     assert end.sigma_across < 0.6, "its line is seen as well as ever"
 
 
-def test_a_needle_beside_the_expected_place_is_found_within_the_search() -> None:
+def test_a_needle_away_from_the_expected_place_is_found_within_the_search() -> None:
     beside = END + np.array([0.0, 9.0])
     drawn = maps(0.0, 0.8, end=beside)
     end = fitted(drawn, 0.0, across=12.0)

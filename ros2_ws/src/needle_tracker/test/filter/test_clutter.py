@@ -58,7 +58,7 @@ def test_reported_tips_are_right(
     assert found >= least
 
 
-def test_clutter_without_a_needle_is_no_needle(
+def test_clutter_without_a_needle_is_rejected(
     tracker: NeedleTracker, calibration_path: Path
 ) -> None:
     for length, _, left, right in insertion(calibration_path, "absent", 2, 35, 50):

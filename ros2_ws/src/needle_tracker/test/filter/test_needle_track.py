@@ -47,7 +47,7 @@ def test_an_end_at_the_insertion_is_the_needle_at_once(settings: StereoTrackerPa
     assert after(settings, [0.05], [0.051]).log_odds() > ACCEPTED
 
 
-def test_an_object_at_rest_while_the_stage_moves_is_no_needle(
+def test_an_object_at_rest_while_the_stage_moves_is_rejected(
     settings: StereoTrackerParameters,
 ) -> None:
     insertions = [0.049 + 5e-4 * n for n in range(8)]

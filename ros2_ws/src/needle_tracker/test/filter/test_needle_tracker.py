@@ -196,7 +196,7 @@ def test_without_an_encoder_a_needle_that_advanced_undetected_is_found_again(
     assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
 
 
-def test_without_an_encoder_a_needle_is_found_beside_an_old_static_track(
+def test_without_an_encoder_a_needle_is_found_near_an_old_track(
     tracker: NeedleTracker, draw_pair: Drawer
 ) -> None:
     old, reasons = arc(0.045, 5.0, 0.5), []

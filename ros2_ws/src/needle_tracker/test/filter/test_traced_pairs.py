@@ -115,7 +115,7 @@ def test_a_needle_in_a_box_before_clutter_is_found_through_its_walls(
 
 
 @pytest.mark.parametrize("known", KNOWN)
-def test_old_tracks_and_rails_behind_a_box_are_no_needle(
+def test_old_tracks_and_rails_behind_a_box_are_rejected(
     calibration: StereoCalibration, known: dict[str, bool]
 ) -> None:
     assert not any(tip for tip, _ in tracked(calibration, "box_empty", **known))

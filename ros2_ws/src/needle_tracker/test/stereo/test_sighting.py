@@ -23,7 +23,7 @@ Search = Callable[..., StereoSearch]
 
 
 @dataclasses.dataclass
-class SeenLines:
+class DrawnLines:
     """Stand-in for a detector: the lines in a camera's view, each from the entry to its end.
 
     The search at half size sees no thin lines.
@@ -69,7 +69,7 @@ def search(views: Views) -> Search:
     def make(
         left: list[np.ndarray], right: list[np.ndarray], *, are_thin: bool = False
     ) -> StereoSearch:
-        detectors = SeenLines(views[0], left, are_thin), SeenLines(views[1], right, are_thin)
+        detectors = DrawnLines(views[0], left, are_thin), DrawnLines(views[1], right, are_thin)
         return StereoSearch(views, detectors, settings)  # type: ignore[arg-type]
 
     return make
@@ -123,7 +123,7 @@ def test_sightings_are_only_at_the_given_distances(search: Search, needle: np.nd
 
 def test_evidence_is_the_sum_over_the_views(views: Views, needle: np.ndarray) -> None:
     ends = (
-        SeenLines(view, [needle]).ends_near(view.project(needle[-1]), np.zeros(2), hidden=False)[0]
+        DrawnLines(view, [needle]).ends_near(view.project(needle[-1]), np.zeros(2), hidden=False)[0]
         for view in views
     )
     left, right = ends

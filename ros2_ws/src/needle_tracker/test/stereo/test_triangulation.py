@@ -17,7 +17,9 @@ START = TIP + np.array([3e-3, -2e-3, 4e-3])
 HEADING = np.array([0.08, -0.3, 0.95]) / np.linalg.norm([0.08, -0.3, 0.95])
 
 
-def seen(views: Views, tip: np.ndarray = TIP, heading: np.ndarray = HEADING) -> list[ImageEnd]:
+def image_ends(
+    views: Views, tip: np.ndarray = TIP, heading: np.ndarray = HEADING
+) -> list[ImageEnd]:
     tips = []
     for view in views:
         ahead, behind = view.project(np.stack([tip + 5e-5 * heading, tip - 5e-5 * heading]))
@@ -27,7 +29,7 @@ def seen(views: Views, tip: np.ndarray = TIP, heading: np.ndarray = HEADING) -> 
 
 
 def test_exact_images_give_the_exact_tip(views: Views) -> None:
-    left, right = seen(views)
+    left, right = image_ends(views)
     tip = triangulate(views, (left, right), START)
     assert tip is not None
     np.testing.assert_allclose(tip.position, TIP, atol=1e-11)
@@ -36,7 +38,7 @@ def test_exact_images_give_the_exact_tip(views: Views) -> None:
 
 
 def test_shafts_in_opposite_directions_are_not_one_needle(views: Views) -> None:
-    left, right = seen(views)
+    left, right = image_ends(views)
     for one, other in ((left, turned(right)), (turned(left), right)):
         assert triangulate(views, (one, other), START) is None
 
@@ -62,7 +64,7 @@ def measured(tip: ImageEnd, rng: np.random.Generator) -> ImageEnd:
 
 def test_covariances_fit_the_errors(views: Views) -> None:
     rng = np.random.default_rng(0)
-    exact = seen(views)
+    exact = image_ends(views)
     errors, plain, turns = [], [], []
     squared = []
     for _ in range(400):
@@ -92,7 +94,7 @@ def test_the_covariance_of_the_direction_agrees_with_finite_differences(views: V
     sigmas, turn = (1e-3, 6e-3), 1e-4
     exact = [
         dataclasses.replace(tip, sigma_angle=sigma)
-        for tip, sigma in zip(seen(views), sigmas, strict=True)
+        for tip, sigma in zip(image_ends(views), sigmas, strict=True)
     ]
     expected = np.zeros((3, 3))
     for i, sigma in enumerate(sigmas):
@@ -113,7 +115,7 @@ def test_the_covariance_of_the_direction_agrees_with_finite_differences(views: V
 
 def test_the_misfit_of_two_ends_of_one_needle_is_chi_squared(views: Views) -> None:
     rng = np.random.default_rng(1)
-    exact, misfits = seen(views), []
+    exact, misfits = image_ends(views), []
     for _ in range(400):
         left, right = (measured(tip, rng) for tip in exact)
         tip = triangulate(views, (left, right), START)
@@ -129,11 +131,11 @@ def test_the_misfit_of_two_ends_of_one_needle_is_chi_squared(views: Views) -> No
 
 def test_a_needle_along_the_baseline_has_no_direction(views: Views) -> None:
     across = np.array([0.0, 1.0, 0.0])
-    tips = seen(views, np.array([0.0, 0.0, 0.0625]), across)
+    tips = image_ends(views, np.array([0.0, 0.0, 0.0625]), across)
     tip = triangulate(views, (tips[0], tips[1]), START)
     assert tip is None or tip.direction_covariance.trace() > 1e-3
     # However certain the lines are, residual calibration errors would determine the direction.
-    tips = seen(views, np.array([0.0, 0.0, 0.0625]), across + np.array([0.0, 0.0, 1e-3]))
+    tips = image_ends(views, np.array([0.0, 0.0, 0.0625]), across + np.array([0.0, 0.0, 1e-3]))
     left, right = (dataclasses.replace(tip, sigma_angle=1e-9) for tip in tips)
     assert triangulate(views, (left, right), START) is None
 
@@ -142,6 +144,6 @@ def test_a_needle_along_the_baseline_has_no_direction(views: Views) -> None:
 def test_views_that_do_not_meet_in_the_phantom_do_not_pass_silently(
     views: Views, gap: float
 ) -> None:
-    left, right = seen(views)
+    left, right = image_ends(views)
     tip = triangulate(views, (left, moved(right, 0.0, gap, 0.0)), START)
     assert tip is None or abs(tip.position[0] - TIP[0]) > 0.02
