@@ -319,8 +319,7 @@ class NeedleTrack:
 
         P(else) / P(needle) = (e^(-other - motion) + e^-end [e^-motion] + e^-shadow) e^-length
         """
-        evidence = self.recent_evidence + self.earlier_evidence
-        no_end = -_bounded(FILTER.prior_log_odds + evidence)
+        no_end = -_bounded(self.recent_evidence + self.earlier_evidence)
         if self.insertion is None:
             no_end -= self.motion_log_odds
         others = _log_sum(-FILTER.other_log_odds - self.motion_log_odds, no_end)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.detector.end_fit import ImageEnd
+from needle_tracker.detector.end_fit import FIT, ImageEnd
 from needle_tracker.detector.needle_detector import DETECTOR, NeedleDetector
 from needle_tracker.detector.needle_net import NeedleNet
 from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
@@ -327,12 +327,21 @@ class NeedleTracker:
         """Return the tip to be published of an accepted needle; None if it is too uncertain.
 
         Errors from the bevel, its lighting or a shadow beside the shaft persist from pair to pair:
-        they cancel in displacements, and averaging pairs would not reduce them.
+        they cancel in displacements, and averaging pairs would not reduce them. The direction is
+        that of a straight line, from which the end of a bent needle differs.
         """
         if float(np.linalg.eigvalsh(tip.covariance)[-1]) > FILTER.max_sigma**2:
             return None
-        hidden = FILTER.end_sigma * self.settings.needle_width * tip.direction
-        return dataclasses.replace(tip, covariance=tip.covariance + np.outer(hidden, hidden))
+        settings = self.settings
+        along = np.outer(tip.direction, tip.direction)
+        hidden = FILTER.end_sigma * settings.needle_width
+        # Half the line's length times the curvature, which is uniform up to the largest one.
+        turn = settings.max_curvature * FIT.line_widths * settings.needle_width / math.sqrt(12.0)
+        return dataclasses.replace(
+            tip,
+            covariance=tip.covariance + hidden**2 * along,
+            direction_covariance=tip.direction_covariance + turn**2 * (np.eye(3) - along),
+        )
 
     def _best(self) -> NeedleTrack | None:
         return max(self._tracks, key=lambda track: track.rank(), default=None)

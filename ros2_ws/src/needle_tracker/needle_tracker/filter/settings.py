@@ -29,9 +29,6 @@ class FilterSettings:
         Log-odds of the length of a shadow, within 10 % of that of its needle, against any distance.
     length_sigma : float
         Standard deviation of the length of the shaft [m], from path-traced pairs.
-    prior_log_odds : float
-        Log-odds that two ends that meet are real, before the network is evaluated: from 231
-        sightings in path-traced pairs (logistic regression, with a weight of 1 for the evidence).
     evidence_length : float
         Travel of the tip over which the images become independent [m]: a repeated image is no
         further evidence.
@@ -59,7 +56,6 @@ class FilterSettings:
     shadow_log_odds: float = 3.0
     shadow_length: float = 2.5
     length_sigma: float = 0.4e-3
-    prior_log_odds: float = -1.0
     evidence_length: float = 10e-3
     miss_cost: float = 0.5
     max_log_odds: float = 8.0

@@ -92,7 +92,9 @@ def test_the_end_in_only_one_view_is_reported(search: Search, needle: np.ndarray
 def test_one_needle_in_both_views_is_one_sighting(
     search: Search, needle: np.ndarray, is_thin: bool
 ) -> None:
-    (sighting,) = search([needle], [needle], are_thin=is_thin).search(3e-3, 0.15)[0]
+    # The left view shows the end twice, nearly at the same place.
+    lines = [needle, needle + np.array([0.0, 1e-4, 0.0])]
+    (sighting,) = search(lines, [needle], are_thin=is_thin).search(3e-3, 0.15)[0]
     np.testing.assert_allclose(sighting.tip.position, needle[-1], atol=0.05e-3)
     assert sighting.length == pytest.approx(0.06, abs=0.6e-3)
     assert sighting.evidence > 4.0
@@ -121,7 +123,7 @@ def test_sightings_are_only_at_the_given_distances(search: Search, needle: np.nd
     assert search([needle], [needle]).search(0.07, 0.08)[0] == []
 
 
-def test_evidence_is_the_sum_over_the_views(views: Views, needle: np.ndarray) -> None:
+def test_evidence_is_the_sum_over_views_and_maps(views: Views, needle: np.ndarray) -> None:
     ends = (
         DrawnLines(view, [needle]).ends_near(view.project(needle[-1]), np.zeros(2), hidden=False)[0]
         for view in views
@@ -129,10 +131,11 @@ def test_evidence_is_the_sum_over_the_views(views: Views, needle: np.ndarray) ->
     left, right = ends
     tip = triangulate(views, (left, right), needle[-1])
     assert tip is not None
-    sure = evidence((left, right), tip)
-    doubtful = evidence((left, dataclasses.replace(right, ends=0.05)), tip)
-    assert sure == pytest.approx(2.0 * np.log(0.95 / 0.05) - 0.5 * tip.misfit)
-    assert doubtful == pytest.approx(-0.5 * tip.misfit, abs=1e-9)
+    doubtful = dataclasses.replace(right, ends=0.05, shaft=1.0 - left.shaft)
+    assert evidence((left, doubtful), tip) == pytest.approx(-0.5 * tip.misfit, abs=1e-9)
+    shaft = np.log(left.shaft / (1.0 - left.shaft))
+    added = 2.0 * np.log(0.95 / 0.05) + shaft
+    assert evidence((left, right), tip) == pytest.approx(added - 0.5 * tip.misfit)
     assert evidence((left, dataclasses.replace(right, ends=1.5)), tip) < 10.0
 
 
