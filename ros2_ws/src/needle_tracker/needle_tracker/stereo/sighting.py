@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,9 +120,10 @@ class StereoSearch:
         # Over a pattern or dull metal, some needles are visible at one of the scales only.
         for full_size in (False, True)[: max(d.scales for d in self.detectors)]:
             shafts = find_shafts(grid, self.detectors, least, most, full_size=full_size) or shafts
-            found = [each for shaft in shafts for each in self._sightings(grid, shaft, least, most)]
-            if found:
-                sightings = _distinct(found)
+            sightings = _distinct(
+                each for shaft in shafts for each in self._sightings(grid, shaft, least, most)
+            )
+            if sightings:
                 return sightings, sightings[0].ends
         if not shafts:
             return [], (None, None)
@@ -193,13 +194,13 @@ def evidence(ends: tuple[ImageEnd, ImageEnd], tip: SpatialTip) -> float:
     return seen - 0.5 * tip.misfit
 
 
-def _distinct(sightings: list[Sighting]) -> list[Sighting]:
-    """Return one sighting of each end, the one with the most evidence, in order of evidence."""
+def _distinct(sightings: Iterable[Sighting]) -> list[Sighting]:
+    """Return the first sighting of each end, which has the best path, in order of evidence."""
     kept: list[Sighting] = []
-    for each in sorted(sightings, key=lambda sighting: -sighting.evidence):
+    for each in sightings:
         if all(_is_other(each.tip, one.tip) for one in kept):
             kept.append(each)
-    return kept
+    return sorted(kept, key=lambda sighting: -sighting.evidence)
 
 
 def _is_other(tip: SpatialTip, other: SpatialTip) -> bool:
