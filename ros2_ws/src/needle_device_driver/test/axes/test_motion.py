@@ -16,3 +16,9 @@ def test_rest_of_a_period_uses_the_speed_of_the_next_leg() -> None:
     for scale, reached in ((1.0, 1.2), (0.5, 1.05)):
         at = copy.deepcopy(motion).advance(0.3, scale)
         assert (at.insertion, at.rotation) == pytest.approx((reached, -2.0))
+
+
+def test_last_set_point_is_exactly_the_target() -> None:
+    # In floating point, 0.7 + (0.1 - 0.7) is not 0.1.
+    set_point = CoordinatedMotion((0.0, 0.7), [Leg(0.1, 0.1, 0.5)]).advance(0.5, 1.0)
+    assert (set_point.insertion, set_point.rotation) == (0.1, 0.1)
