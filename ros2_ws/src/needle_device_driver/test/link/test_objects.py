@@ -36,6 +36,11 @@ def test_entries_and_pdos_are_packed_little_endian() -> None:
             entry.pack(value)
 
 
+def test_position_is_rounded_to_the_nearest_count() -> None:
+    counts = [DRIVE.counts(share / DRIVE.counts_per_unit) for share in (0.6, 1.4, -0.6)]
+    assert counts == [1, 1, -1]
+
+
 def test_reverse_drive_swaps_its_limits() -> None:
     reverse = dataclasses.replace(DRIVE, reverse=True)
     assert DRIVE.limits_counts == (-20_000, 4_020_000)
