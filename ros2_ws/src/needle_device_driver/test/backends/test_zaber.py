@@ -174,6 +174,8 @@ def test_a_restart_shows_behind_a_higher_flag() -> None:
     line.receive_lines("@01 1 08 OK IDLE WV 900", "@01 1 41 OK IDLE WV 02 WV WR")
     line.receive_lines("@02 1 08 OK IDLE WV 900", "@02 1 41 OK IDLE WV 01 WV")
     assert (line.state().rebooted, line.state("rotation").rebooted) == (True, False)
+    line.run(line.protocol.clear_fault("insertion"))
+    assert line.commands[-1] == "1 1 warnings clear"
 
 
 COMPLETE = (
