@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from needle_device_driver.parameters import AXES, DeviceDriverParameters
@@ -16,11 +16,11 @@ P = TypeVar("P", bound=DriveProtocol)
 class ProtocolBench(Generic[P]):
     """Runs the procedures of a protocol, and records the states that it reports."""
 
-    def __init__(self, kind: type[P], axes: Sequence[str] = AXES, **parameters: Any) -> None:
+    def __init__(self, kind: type[P], **parameters: Any) -> None:
         settings = DeviceDriverParameters(**parameters)
         self.link = TextLink("test", kind.terminators)
         self.link.open()
-        self.protocol = kind(settings, {axis: settings.axis(axis) for axis in axes}, self.link)
+        self.protocol = kind(settings, {axis: settings.axis(axis) for axis in AXES}, self.link)
         self.states: list[tuple[int, dict[str, DriveReply]]] = []
         self.protocol.on_status = lambda number, at: self.states.append((number, dict(at)))
 

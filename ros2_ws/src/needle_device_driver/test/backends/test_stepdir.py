@@ -8,9 +8,7 @@ import pytest
 
 from needle_device_driver.axes.link import DriveError
 from needle_device_driver.backends.stepdir import StepdirProtocol
-from needle_device_driver.parameters import AXES
 from needle_device_driver.polled.drive_protocol import DriveReply
-from needle_device_driver.procedure import Running, side_by_side
 
 from .protocol_bench import ProtocolBench
 
@@ -18,9 +16,9 @@ from .protocol_bench import ProtocolBench
 class Board(ProtocolBench[StepdirProtocol]):
     """A board that replies by letter; without a reply it is silent."""
 
-    def __init__(self, *axes: str, **parameters: Any) -> None:
+    def __init__(self, **parameters: Any) -> None:
         counts = {"insertion_counts_per_unit": 1.6e6, "rotation_counts_per_unit": 1000.0}
-        super().__init__(StepdirProtocol, axes or AXES, **counts | parameters)
+        super().__init__(StepdirProtocol, **counts | parameters)
         self.replies = {b"I": b",stepdir,1,10000", b"C": b"", b"R": b""}
         self.lines: list[bytes] = []
 
@@ -57,9 +55,9 @@ def test_orders_and_a_request_have_these_bytes() -> None:
     board.protocol.beat()
     board.protocol.request(7)
     assert board.sent() == b"$0,P,0,1*4D\n$1,M,1,-250,20*55\n$2,H,0*4A\n$3,B*5D\n$4,S*4B\n"
-    # In pieces, after noise, and after a line without its checksum.
+    # After noise, after a line with a wrong checksum, and in pieces.
     board.receive(b"\xff\n$4,S,0,9,9,9,9*00\n$4,S,0,800,2", b"1,-250,27", b"*73\n")
-    # The same answer again, and one to an unknown line.
+    # A second answer to the same line, and one to an unknown line.
     board.receive_frame(b"4,S,0,0,16,0,16")
     board.receive_frame(b"9,S,0,0,16,0,16")
     insertion = DriveReply(800, moving=False, powered=True, home_switch=True)
@@ -67,12 +65,11 @@ def test_orders_and_a_request_have_these_bytes() -> None:
     assert board.states == [(7, {"insertion": insertion, "rotation": rotation})]
 
 
-def test_a_board_with_one_axis_is_stopped_by_its_dead_man() -> None:
-    board = Board("insertion")
+def test_a_stop_by_the_dead_man_shows() -> None:
+    board = Board()
     board.protocol.request(1)
     board.receive_frame(b"0,S,1,5,17,0,17")
-    found = DriveReply(5, moving=False, powered=True, timed_out=True)
-    assert board.states == [(1, {"insertion": found})]
+    assert board.state() == DriveReply(5, moving=False, powered=True, timed_out=True)
 
 
 def test_a_board_that_is_too_slow_silent_or_of_another_version_is_an_error() -> None:
@@ -86,19 +83,3 @@ def test_a_board_that_is_too_slow_silent_or_of_another_version_is_an_error() -> 
     del board.replies[b"I"]
     with pytest.raises(DriveError, match="no answer"):
         board.run(board.protocol.identify())
-
-
-def test_lines_are_numbered_in_the_order_of_sending() -> None:
-    board = Board()
-    board.run(board.protocol.identify())
-    running = Running(side_by_side(*(board.protocol.set_up(axis) for axis in AXES)))
-    while not running.advance(board.link.now):
-        board.link.now += 0.005
-        if round(board.link.now * 1e3) % 30 == 0:
-            board.reply(board.sent())
-    for _ in range(300):
-        board.protocol.beat()
-    board.reply(board.sent())
-    numbers = [int(line[1:].split(b",")[0]) for line in board.lines if line.startswith(b"$")]
-    assert len(numbers) > 306
-    assert numbers == [number % 256 for number in range(len(numbers))]

@@ -2,45 +2,42 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
 
 from needle_device_driver.cia402.drive_upkeep import are_emulated
-from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutError
 from needle_device_driver.procedure import Procedure, run_at_once
 
 
 class Named:
-    """A bus on which each node has a name, refuses to report it, or is missing."""
+    """A node that reports its name, refuses to, or does not answer."""
 
-    def __init__(self, *names: bytes | Exception) -> None:
-        self._names = names
-        self.beats = 0
+    def __init__(self, name: bytes | Exception) -> None:
+        self.name = name
 
-    def beat(self) -> None:
-        self.beats += 1
-
-    def sdo_client(self, node: int) -> Any:
-        self._name = self._names[node - 1]
-        return self
-
-    def upload(self, index: int, subindex: int) -> Procedure[bytes]:
+    def upload(self, index: int, _: int) -> Procedure[bytes]:
         yield from ()
-        assert (index, subindex) == (0x1008, 0)
-        if isinstance(self._name, Exception):
-            raise self._name
-        return self._name
+        assert index == 0x1008
+        if isinstance(self.name, Exception):
+            raise self.name
+        return self.name
 
 
-def test_drives_count_as_real_unless_all_report_emulated() -> None:
-    for second, emulated in (
+@pytest.mark.parametrize(
+    ("second", "emulated"),
+    [
         (b"Emulated rotation drive", True),
         (b"EL7041", False),
-        (b"", False),
         (SdoAbortedError(0x0602_0000), False),
         (SdoTimeoutError(), False),
-    ):
-        for nodes in ((1, 2), (2, 1)):
-            bus = Named(b"Emulated insertion drive", second)
-            assert run_at_once(are_emulated(cast(FrameLink, bus), nodes)) is emulated
-            assert bus.beats >= 1
+    ],
+)
+def test_drives_count_as_real_unless_all_report_emulated(
+    second: bytes | Exception, emulated: bool
+) -> None:
+    nodes = {1: Named(b"Emulated insertion drive"), 2: Named(second)}
+    bus: Any = SimpleNamespace(beat=lambda: None, sdo_client=nodes.__getitem__)
+    assert run_at_once(are_emulated(bus, nodes)) is emulated

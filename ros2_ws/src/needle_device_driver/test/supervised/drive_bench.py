@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
+from needle_core.can_frame import CanFrame
 from needle_device_driver.cia402.backend import Cia402Drives, drive_settings
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.parameters import DeviceDriverParameters
+from needle_device_driver.parameters import AXES, DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
-from .scripted_drives import ScriptedBus, ScriptedDrive
+from .scripted_drives import ScriptedDrive
 from .supervisor_bench import PERIOD, SupervisorBench
 
 # Counts per radian of the rotation drive.
@@ -21,11 +21,26 @@ RAD = 65536 / 6.283185307179586
 _FRAME_TIME = 0.0005
 
 
-class BenchLink(FrameLink):
-    """A link with virtual time; answers arrive while a frame is sent."""
+class ScriptedBus(FrameLink):
+    """A link to scripted drives in virtual time; answers arrive while a frame is sent.
+
+    Attributes
+    ----------
+    sent : list
+        COB-ID and data of each frame that the driver sent.
+    late : bool
+        Whether answers wait for the next `flush`.
+    fault : str
+        Why the adapter does not send; empty: it sends.
+    absent : bool
+        Whether there is no adapter.
+    """
 
     def __init__(self, name: str, bench: DriveBench) -> None:
         self._bench = bench
+        self.sent: list[tuple[int, bytes]] = []
+        self.late = self.absent = False
+        self.fault = ""
         super().__init__(name)
 
     @property
@@ -38,18 +53,32 @@ class BenchLink(FrameLink):
 
     def open(self) -> None:
         if not self.is_open:
-            self.set_port_error("no such file" if self._bench.no_adapter else "")
+            self.set_port_error("no such file" if self.absent else "")
             super().open()
-            self._bench.broken = ""
+            self.fault = ""
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         super().send(cob_id, data)
         self.pop_outgoing()
-        if self._bench.broken:
-            self.set_port_error(self._bench.broken)
+        if self.fault:
+            self.set_port_error(self.fault)
             return
         self._bench.now += _FRAME_TIME + self._bench.sdo_time * (cob_id in (0x601, 0x602))
-        self._bench.bus.send(cob_id, data)
+        self.sent.append((cob_id, data))
+        for drive in self._bench.scripts:
+            drive.receive(cob_id, data)
+        if not self.late:
+            self.flush()
+
+    def flush(self) -> None:
+        for drive in self._bench.scripts:
+            out, drive.out = drive.out, []
+            for cob_id, data in out:
+                self.put(cob_id, data)
+
+    def put(self, cob_id: int, data: bytes) -> None:
+        """Receive a frame."""
+        self.receive([CanFrame(cob_id, data)])
 
 
 class DriveBench(SupervisorBench):
@@ -57,31 +86,18 @@ class DriveBench(SupervisorBench):
 
     def __init__(self, **parameters: Any) -> None:
         super().__init__()
-        self.insertion, self.rotation = ScriptedDrive(1), ScriptedDrive(2)
-        self.no_adapter = False
-        # Why the adapter does not send; empty: it sends. Duration of an SDO transfer [s].
-        self.broken = ""
+        self.scripts = self.insertion, self.rotation = ScriptedDrive(1), ScriptedDrive(2)
+        # Duration of an SDO transfer [s].
         self.sdo_time = 0.0
-        self.settings = DeviceDriverParameters(link="virtual", channel="test", **parameters)
-        self.link = BenchLink(self.settings.link_name, self)
-        self.bus = ScriptedBus([self.insertion, self.rotation], lambda f: self.link.receive([f]))
-        watchdog = self.settings.watchdog
+        settings = DeviceDriverParameters(link="virtual", channel="test", **parameters)
+        self.bus = ScriptedBus(settings.link_name, self)
         self.axes = [
-            Cia402Axis(
-                name,
-                drive_settings(self.settings, name),
-                self.link,
-                watchdog=watchdog,
-            )
-            for name in ("insertion", "rotation")
+            Cia402Axis(name, drive_settings(settings, name), self.bus, settings.watchdog)
+            for name in AXES
         ]
-        self.drives = Cia402Drives(self.link, self.axes, watchdog)
-        self.supervisor = MotionSupervisor(
-            self.axes[0],
-            self.axes[1],
-            self.settings,
-            feedback_delay=1,
-        )
+        self.drives = Cia402Drives(self.bus, self.axes, settings.watchdog)
+        insertion, rotation = self.axes
+        self.supervisor = MotionSupervisor(insertion, rotation, settings, feedback_delay=1)
 
     def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure to its end; unfulfilled waits take their full time."""
@@ -102,9 +118,10 @@ class DriveBench(SupervisorBench):
     def positions(self) -> tuple[int, int]:
         return self.insertion.position, self.rotation.position
 
-    def joint(self, number: int = 0) -> float:
-        """Return the last set-point of a joint."""
-        return self.axes[number].poll(self.now).set_point
+    @property
+    def set_points(self) -> tuple[float, float]:
+        insertion, rotation = (axis.poll(self.now).set_point for axis in self.axes)
+        return insertion, rotation
 
     # ---- states of the rig ----------------------------------------------------------------------
 
@@ -146,12 +163,6 @@ class DriveBench(SupervisorBench):
         self.enabled()
         return self
 
-    def step(self, length: float = 0.001, rotation: float = 0.1, duration: float = 0.5) -> None:
-        joints = self.supervisor.joints(self.now)
-        assert joints is not None
-        at = joints.insertion.position, joints.rotation.position
-        self.submit((at[0] + length, at[1] + rotation, duration))
-
     def moving(self) -> DriveBench:
         """Begin a step of 2 mm and 0.2 rad in 1 s."""
         self.ready()
@@ -166,20 +177,6 @@ class DriveBench(SupervisorBench):
         event()
         self.bus.flush()
         self.go()
-
-    def delay_reaction(self, drive: ScriptedDrive, seconds: float) -> None:
-        """Delay the reaction of a drive to a command by some time [s]; then the drive is off."""
-        due = math.inf
-
-        def command(word: int) -> None:
-            nonlocal due
-            drive.last_word, due = word, self.now + seconds
-
-        def sending() -> None:
-            if self.now >= due:
-                drive.state = "disabled"
-
-        drive.command, self.bus.sending = command, sending  # type: ignore[method-assign]
 
     # ---- checks -------------------------------------------------------------------------------
 

@@ -26,10 +26,6 @@ class IdealAxis(Axis):
         self.fault = ""
         self.orders: list[str] = []
 
-    @property
-    def stops(self) -> int:
-        return self.orders.count("stop")
-
     def _order(self, name: str) -> None:
         if self.unplugged:
             raise AxisError(f"{self.name}: no link")
@@ -119,9 +115,13 @@ class Bench(SupervisorBench):
     def positions(self) -> tuple[float, float]:
         return self.insertion.position, self.rotation.position
 
+    @property
+    def set_points(self) -> tuple[float, float]:
+        return self.positions
+
     def homed(self) -> Bench:
         """Configure, and begin to home."""
-        assert self.configure().success
+        self.configure()
         assert self.home().success
         return self
 
@@ -131,20 +131,6 @@ class Bench(SupervisorBench):
         assert self.enable().success
         self.hold()
         return self
-
-    def step(
-        self,
-        length: float = 0.001,
-        rotation: float = 0.1,
-        duration: float = 0.5,
-        *,
-        stamp_ns: int | None = None,
-        publishers: int = 1,
-    ) -> int:
-        """Submit a step from the present positions; return its stamp."""
-        at = self.positions
-        point = at[0] + length, at[1] + rotation, duration
-        return self.submit(point, stamp_ns=stamp_ns, publishers=publishers)
 
     def moving(self) -> Bench:
         """Begin a step of 2 mm and 0.1 rad in 2 s."""

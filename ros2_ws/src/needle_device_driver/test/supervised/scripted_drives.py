@@ -1,11 +1,9 @@
-"""Scripted CiA 402 drives behind a CAN bus."""
+"""A scripted CiA 402 drive."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-
-from needle_core.can_frame import CanFrame
 
 
 class ScriptedDrive:
@@ -70,19 +68,17 @@ class ScriptedDrive:
         self.more_status = 0
         self.nmt = 0x7F
         self.silent = False
-        self.ignores_reset = False
         self.blocked = False
         self.left_over = 0
-        self.keeps_quick_stop = False
         self.home_after = 3
         self.homing_for = -1
         self.last_word = 0
         self.stale_homing = False
         self.out: list[tuple[int, bytes]] = []
 
-    def set_objects(self, values: dict[tuple[int, int], int], size: int = 4) -> None:
+    def set_objects(self, values: dict[tuple[int, int], int]) -> None:
         """Set values of objects."""
-        self.objects |= {at: value.to_bytes(size, "little") for at, value in values.items()}
+        self.objects |= {at: value.to_bytes(4, "little") for at, value in values.items()}
 
     def value(self, index: int, sub: int = 0) -> int:
         """Return the value of an object."""
@@ -181,10 +177,10 @@ class ScriptedDrive:
 
     def command(self, word: int) -> None:
         order = "quick stop" if word & 0x06 == 0x02 else "" if word & 0x02 else "off"
-        if {order, "all"} & self.ignored_orders:
+        if order in self.ignored_orders:
             return
         if self.state == "fault":
-            if word & 0x80 and not self.last_word & 0x80 and not self.ignores_reset:
+            if word & 0x80 and not self.last_word & 0x80 and "reset" not in self.ignored_orders:
                 self.state = "disabled"
         elif not word & 0x02:
             self.state = "disabled"
@@ -194,9 +190,7 @@ class ScriptedDrive:
             self.state = "ready"
         elif word & 0x0F == 0x07 and self.state in ("ready", "enabled"):
             self.state = "on"
-        elif word & 0x0F == 0x0F and (
-            self.state == "on" or (self.state == "quick stop" and not self.keeps_quick_stop)
-        ):
+        elif word & 0x0F == 0x0F and self.state in ("on", "quick stop"):
             self.state = "enabled"
         rising = word & 0x10 and not self.last_word & 0x10
         self.last_word = word
@@ -209,70 +203,32 @@ class ScriptedDrive:
             self.more_status = 0x1400 if self.stale_homing else 0
 
     def sdo(self, data: bytes) -> None:
-        index, sub = int.from_bytes(data[1:3], "little"), data[3]
-        head = data[1:4]
         if data[0] == 0x80:
             return
-        size = 4 - (data[0] >> 2 & 3)
-        written = data[0] != 0x40
-        code = self.refuses(index, sub, data[4 : 4 + size]) if written else 0
-        if index in self.missing_objects:
+        index, sub, head = int.from_bytes(data[1:3], "little"), data[3], data[1:4]
+        written = b"" if data[0] == 0x40 else data[4 : 8 - (data[0] >> 2 & 3)]
+        live = {
+            (0x6041, 0): self.statusword.to_bytes(2, "little"),
+            (0x6061, 0): bytes([self.mode]),
+            (0x6064, 0): self.position.to_bytes(4, "little", signed=True),
+            (0x60F4, 0): (self.demand - self.position).to_bytes(4, "little", signed=True),
+            (0x60FD, 0): self.inputs.to_bytes(4, "little"),
+        }
+        value = written or live.get((index, sub)) or self.objects.get((index, sub))
+        code = self.refuses(index, sub, written) if written else 0
+        if index in self.missing_objects or value is None:
             code = 0x0602_0000
         if code:
             self.emit(0x580, b"\x80" + head + code.to_bytes(4, "little"))
-        elif not written:
-            live = {
-                (0x6041, 0): self.statusword.to_bytes(2, "little"),
-                (0x6061, 0): bytes([self.mode]),
-                (0x6064, 0): self.position.to_bytes(4, "little", signed=True),
-                (0x60F4, 0): (self.demand - self.position).to_bytes(4, "little", signed=True),
-                (0x60FD, 0): self.inputs.to_bytes(4, "little"),
-            }
-            value = live.get((index, sub)) or self.objects.get((index, sub))
-            if value is None:
-                self.emit(0x580, b"\x80" + head + bytes.fromhex("00000206"))
-                return
+            return
+        assert value is not None
+        if not written:
             first = 0x43 | (4 - len(value)) << 2
             self.emit(0x580, bytes([first]) + head + value.ljust(4, b"\x00"))
-        else:
-            self.objects[index, sub] = self.stores(index, data[4 : 4 + size])
-            if index == 0x6040 and not (self.ignores_sdo_orders and self.nmt == 0x05):
-                self.command(int.from_bytes(data[4:6], "little"))
-            if index == 0x6060 and data[4] in self.modes:
-                self.mode = data[4]
-            self.emit(0x580, b"\x60" + head + bytes(4))
-
-
-class ScriptedBus:
-    """A bus with scripted drives that answer at once; records the frames."""
-
-    def __init__(
-        self,
-        drives: list[ScriptedDrive],
-        receive: Callable[[CanFrame], None],
-        sending: Callable[[], None] = lambda: None,
-    ) -> None:
-        self.receive = receive
-        self.sending = sending
-        self.drives = drives
-        self.sent: list[tuple[int, bytes]] = []
-        # Whether answers wait for the next `flush`.
-        self.late = False
-
-    def send(self, cob_id: int, data: bytes) -> None:
-        self.sending()
-        self.sent.append((cob_id, data))
-        for drive in self.drives:
-            drive.receive(cob_id, data)
-        if not self.late:
-            self.flush()
-
-    def flush(self) -> None:
-        for drive in self.drives:
-            out = list(drive.out)
-            drive.out.clear()
-            for cob_id, data in out:
-                self.put(cob_id, data)
-
-    def put(self, cob_id: int, data: bytes) -> None:
-        self.receive(CanFrame(cob_id, data))
+            return
+        self.objects[index, sub] = self.stores(index, written)
+        if index == 0x6040 and not (self.ignores_sdo_orders and self.nmt == 0x05):
+            self.command(int.from_bytes(written, "little"))
+        if index == 0x6060 and written[0] in self.modes:
+            self.mode = written[0]
+        self.emit(0x580, b"\x60" + head + bytes(4))

@@ -36,6 +36,11 @@ class SupervisorBench(abc.ABC):
     def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure to its end."""
 
+    @property
+    @abc.abstractmethod
+    def set_points(self) -> tuple[float, float]:
+        """Insertion [m] and rotation [rad] from which a command begins."""
+
     @abc.abstractmethod
     def exchange(self) -> None:
         """Run the supervisor's cycle."""
@@ -45,10 +50,6 @@ class SupervisorBench(abc.ABC):
     @property
     def state(self) -> str:
         return self.supervisor.state.value
-
-    @property
-    def activity(self) -> str:
-        return self.status.activity
 
     @property
     def status(self) -> DeviceStatus:
@@ -126,6 +127,13 @@ class SupervisorBench(abc.ABC):
         stamp = self.ros_ns if stamp_ns is None else stamp_ns
         self.supervisor.submit(command(stamp, *points), self.now, publishers)
         return stamp
+
+    def step(
+        self, length: float = 0.001, rotation: float = 0.1, duration: float = 0.5, **details: int
+    ) -> int:
+        """Submit a step from the last set-points; return its stamp."""
+        insertion, turn = self.set_points
+        return self.submit((insertion + length, turn + rotation, duration), **details)
 
     # ---- time ---------------------------------------------------------------------------------
 

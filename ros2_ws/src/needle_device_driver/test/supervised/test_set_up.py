@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from functools import partial
+from typing import Any
 
 import pytest
 
@@ -13,7 +11,7 @@ from needle_device_driver.axes.axis import AxisError
 from .drive_bench import DriveBench
 from .scripted_drives import ScriptedDrive
 
-Change = Callable[[ScriptedDrive], None]
+Change = dict[str, Any]
 Values = dict[tuple[int, int], int]
 
 READ_ONLY, TOO_LONG, NOT_MAPPABLE = 0x0601_0002, 0x0607_0012, 0x0604_0041
@@ -23,25 +21,23 @@ TURN = {(0x608F, 1): 20_000, (0x608F, 2): 1}
 IN_RPM = {(0x60A9, 0): RPM, (0x60AA, 0): RPM_S, **TURN}
 # 5 mm/s, 2 mm/s to the switch, a quarter of that away from it; 50 mm/s^2, stops at 500 mm/s^2.
 SPEEDS = {(0x607F, 0): 100_000, (0x6081, 0): 100_000, (0x6099, 1): 40_000, (0x6099, 2): 10_000}
-REQUIRED = {0x605A: 6, 0x605E: 2, 0x6007: 1, 0x607C: 0, 0x60C2: 20}
+REQUIRED = {0x605A: 6, 0x605E: 2, 0x6007: 1, 0x607C: 0, 0x607D: 2**31 - 1, 0x60C2: 20}
 RAMPS = {(0x6083, 0): 10**6, (0x6084, 0): 10**6, (0x609A, 0): 10**6, (0x6085, 0): 10**7}
 
 
-def all_of(*changes: Change) -> Change:
-    def change(drive: ScriptedDrive) -> None:
-        for one in changes:
-            one(drive)
-
-    return change
-
-
 def has(**attributes: object) -> Change:
-    return lambda drive: drive.__dict__.update(attributes)
+    """Change attributes of a drive."""
+    return attributes
 
 
 def reports(values: Values) -> Change:
-    """Set values of a drive."""
-    return lambda drive: drive.set_objects(values)
+    """Set values of objects."""
+    return has(objects={at: value.to_bytes(4, "little") for at, value in values.items()})
+
+
+def change(drive: ScriptedDrive, attributes: Change) -> None:
+    objects = drive.objects | attributes.get("objects", {})
+    drive.__dict__.update(attributes, objects=objects)
 
 
 def lacks(*indices: int) -> Change:
@@ -64,10 +60,6 @@ def makes(index: int, wanted: int, made: int) -> Change:
     return has(stores=stores)
 
 
-def kept(index: int, wanted: int, made: int) -> tuple[Change, str]:
-    return makes(index, wanted, made), f"was set to {wanted} at 0x{index:04X}"
-
-
 def in_unit(index: int, code: int, unit: str) -> tuple[Change, str]:
     what = {0x60A8: "positions", 0x60A9: "speeds", 0x60AA: "ramps"}[index]
     text = f"the drive measures {what} in {unit} (0x{index:04X} = 0x{code:08X}), expected counts"
@@ -84,34 +76,25 @@ REFUSED: list[tuple[Change, str]] = [
     (reports({(0x1000, 0): 401}), "node 1 has device profile 401, expected 402"),
     (reports({(0x6502, 0): 0x205}), "node 1 has no homing mode (0x6502 = 0x00000205)"),
     (
-        all_of(reports({(0x6502, 0): 0x225}), has(modes={6})),
+        reports({(0x6502, 0): 0x225}) | has(modes={6}),
         "node 1 has no cyclic synchronous position mode (0x6060 = 8, 0x6061 = 0)",
     ),
-    (
-        all_of(lacks(0x6502), has(modes={8})),
-        "node 1 has no homing mode (0x6060 = 6, 0x6061 = 0)",
-    ),
-    (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x06")), "write 8 to 0x6060:0 mode"),
+    (lacks(0x6502) | has(modes={8}), "no homing mode (0x6060 = 6, 0x6061 = 0)"),
+    (has(state="enabled", ignored_orders={"off"}), "node 1 does not switch off"),
     (makes(0x1016, 127 << 16 | 100, 0), "0x1016:1 consumer heartbeat time but reads back 0"),
-    (all_of(reports({(0x1017, 0): 0}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
-    (all_of(reports({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
+    (reports({(0x1017, 0): 0}) | refuses(READ_ONLY, 0x1017), "30 to 0x1017:0"),
+    (reports({(0x1017, 0): 201}) | refuses(READ_ONLY, 0x1017), "30 to 0x1017:0"),
     (refuses(RANGE, 0x605A), "node 1 refuses to write 6 to 0x605A:0"),
     (refuses(RANGE, 0x605E), "node 1 refuses to write 2 to 0x605E:0"),
     # Homing to a switch is never replaced by homing at the present position.
     (refuses(RANGE, 0x6098, but=b"\x25"), "refuses to write 17 to 0x6098:0"),
-    # It happens to have the values for a drive without home.
-    (
-        all_of(reports({(0x607D, 1): 2**31, (0x607D, 2): 2**31 - 1}), refuses(READ_ONLY, 0x607D)),
-        "refuses to write -2147483648 to 0x607D:1",
+    *(
+        (makes(index, value, 5), f"was set to {value} at 0x{index:04X}")
+        for index, value in REQUIRED.items()
     ),
-    *(kept(0x607D, wanted, 0) for wanted in (-(2**31), 2**31 - 1)),
-    *(kept(index, wanted, 5) for index, wanted in REQUIRED.items()),
     # Units other than counts and rpm.
     in_unit(0x60A9, 0xFD01_0300, "10^-3 m/s"),
-    in_unit(0x60A9, 0x0010_0300, "rad/s"),
-    in_unit(0x60A9, 0x0041_4700, "deg/min"),
     in_unit(0x60A9, 0x7F77_9900, "10^127 unit 0x77 per unit 0x99"),
-    in_unit(0x60A9, RPM_S, "rpm/s"),
     in_unit(0x60AA, RPM, "rpm"),
     in_unit(0x60A8, 0xFFB5_0000, "10^-1 counts"),
     # Counts per turn unknown or ambiguous; an invalid factor.
@@ -121,7 +104,7 @@ REFUSED: list[tuple[Change, str]] = [
     ),
     (fed(360, 1), "reports 50000 (0x608F, 0x6091) and 360 (0x6092) counts per turn"),
     (
-        all_of(lacks(0x60A9, 0x60AA), reports({(0x6096, 1): 60, (0x6096, 2): 20_000})),
+        lacks(0x60A9, 0x60AA) | reports({(0x6096, 1): 60, (0x6096, 2): 20_000}),
         "the drive scales speeds by 0.003 (0x6096), expected counts/s",
     ),
     # It answers no SYNC.
@@ -133,10 +116,10 @@ REFUSED: list[tuple[Change, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("change", "text"), REFUSED)
-def test_drive_without_a_required_object_or_value_is_refused(change: Change, text: str) -> None:
+@pytest.mark.parametrize(("drive", "text"), REFUSED)
+def test_drive_without_a_required_object_or_value_is_refused(drive: Change, text: str) -> None:
     bench = DriveBench()
-    change(bench.insertion)
+    change(bench.insertion, drive)
     bench.sdo_time = 0.02
     refusal = bench.refusal()
     assert refusal.startswith("insertion axis: ")
@@ -144,19 +127,6 @@ def test_drive_without_a_required_object_or_value_is_refused(change: Change, tex
     # The watchdog of the other axis is not armed.
     assert bench.rotation.value(0x1016, 1) == 0
     assert bench.state == "FAULT"
-
-
-def test_refused_rotation_drive_can_be_set_up_after_repair() -> None:
-    bench = DriveBench()
-    change, text = in_unit(0x60A9, 0x0001_0300, "m/s")
-    change(bench.rotation)
-    assert f"rotation axis: {text}" in bench.refusal()
-    bench.rotation.set_objects({(0x60A9, 0): COUNTS})
-    assert bench.reset().success
-    bench.steps()
-    bench = DriveBench()
-    bench.rotation.silent = True
-    assert "rotation axis: node 2 does not answer" in bench.run(bench.drives.probe())
 
 
 def no_types(types: bytes) -> Change:
@@ -183,21 +153,18 @@ WIDTHS = {(0x605A, 0): 1, (0x6066, 0): 4, (0x60C2, 1): 2}
 TAKEN: list[Row] = [
     (has(), {(0x6065, 0): 10_000, (0x607D, 1): -20_000, (0x607D, 2): 4_020_000}, ""),
     units(COUNTS, COUNTS_2, {}, 1.0, 1.0),
-    # Dimensionless units, unused bits; 0.1 counts/s and 10 counts/s^2 (Copley).
-    units(0x0000_035A, 0x0000_5700, {}, 1.0, 1.0),
+    # 0.1 counts/s and 10 counts/s^2 (Copley).
     units(0xFFB5_0300, 0x01B5_5700, {}, 0.1, 10.0),
     units(RPM, RPM_S, TURN, 20_000 / 60, 20_000 / 60),
-    # A gear, and an invalid one; rpm with ramps in counts.
+    # A gear, and an invalid one.
     units(RPM, RPM_S, {**TURN, (0x6091, 1): 5, (0x6091, 2): 2}, 50_000 / 60, 50_000 / 60),
     units(RPM, RPM_S, {**TURN, (0x6091, 1): 0, (0x6091, 2): 0}, 20_000 / 60, 20_000 / 60),
-    units(RPM, COUNTS_2, TURN, 20_000 / 60, 1.0),
     units(COUNTS, RPM_S, {**TURN, (0x6096, 1): 60, (0x6096, 2): 1}, 1.0, 20_000 / 60),
     (fed(100_000, 2), {(0x6085, 0): 12_000}, ""),
-    (all_of(reports(TURN), lacks(0x60A8, 0x60A9, 0x60AA)), SPEEDS | RAMPS, UNREPORTED_UNITS),
-    (reports({(0x60A9, 0): 0, (0x60AA, 0): 0}), SPEEDS | RAMPS, UNREPORTED_UNITS),
-    (all_of(reports(IN_RPM), lacks(0x60AA)), {(0x6085, 0): 30_000}, f"{ASSUMED}the unit of its sp"),
+    (reports(TURN) | lacks(0x60A8, 0x60A9, 0x60AA), SPEEDS | RAMPS, UNREPORTED_UNITS),
+    (reports(IN_RPM) | lacks(0x60AA), {(0x6085, 0): 30_000}, f"{ASSUMED}the unit of its sp"),
     (
-        all_of(lacks(0x60A9), reports({(0x6096, 1): 7, (0x6096, 2): 7})),
+        lacks(0x60A9) | reports({(0x6096, 1): 7, (0x6096, 2): 7}),
         SPEEDS | RAMPS,
         f"{ASSUMED}counts/s (0x60A9);",
     ),
@@ -205,17 +172,14 @@ TAKEN: list[Row] = [
     (refuses(RANGE, 0x605B, 0x1029, 0x1006), {}, "keeps its own 0x605B"),
     (lacks(0x1006, 0x1029, 0x6007), {}, "has no 0x6007"),
     (makes(0x6083, 10**6, 65_535), {(0x6083, 0): 65_535}, ""),
-    (all_of(reports({(0x1017, 0): 200}), refuses(READ_ONLY, 0x1017)), {(0x1017, 0): 200}, ""),
-    (all_of(reports({(0x1017, 0): 1}), refuses(READ_ONLY, 0x1017)), {}, ""),
-    (all_of(reports({(0x605A, 0): 6}), refuses(READ_ONLY, 0x605A)), {(0x605A, 0): 6}, ""),
+    (reports({(0x1017, 0): 200}) | refuses(READ_ONLY, 0x1017), {(0x1017, 0): 200}, ""),
+    (reports({(0x605A, 0): 6}) | refuses(READ_ONLY, 0x605A), {(0x605A, 0): 6}, ""),
     # Unlisted modes are tried after switching off.
-    (all_of(lacks(0x6502), has(state="enabled")), {(0x6040, 0): 0}, ""),
+    (lacks(0x6502) | has(state="enabled"), {(0x6040, 0): 0}, ""),
     # Other sizes than in the standard; counters of less than 32 bits.
     (
-        all_of(
-            has(objects=ScriptedDrive(1).objects | {at: bytes(n) for at, n in WIDTHS.items()}),
-            has(refuses=lambda i, s, v: TOO_LONG * (len(v) != WIDTHS.get((i, s), len(v)))),
-        ),
+        has(objects={at: bytes(n) for at, n in WIDTHS.items()})
+        | has(refuses=lambda i, s, v: TOO_LONG * (len(v) != WIDTHS.get((i, s), len(v)))),
         {(0x605A, 0): 6, (0x6066, 0): 50, (0x60C2, 1): 20},
         "",
     ),
@@ -236,12 +200,12 @@ TAKEN: list[Row] = [
 ]
 
 
-@pytest.mark.parametrize(("change", "wanted", "missing"), TAKEN)
+@pytest.mark.parametrize(("drive", "wanted", "missing"), TAKEN)
 def test_drives_of_many_makers_are_set_up_and_move(
-    change: Change, wanted: Values, missing: str
+    drive: Change, wanted: Values, missing: str
 ) -> None:
     bench = DriveBench()
-    change(bench.insertion)
+    change(bench.insertion, drive)
     bench.run(bench.drives.probe())
     bench.steps()
     assert {at: bench.insertion.value(*at) for at in wanted} == wanted
@@ -250,22 +214,17 @@ def test_drives_of_many_makers_are_set_up_and_move(
 
 
 def test_parameters_override_reported_units() -> None:
-    bench = DriveBench(insertion_counts_per_turn=50_000.0, rotation_max_torque=0.8)
-    fed(360, 1)(bench.insertion)
-    bench.configured()
-    assert bench.insertion.value(0x6085) == 12_000
-    assert (0x6072, 0) not in bench.insertion.objects
-    assert bench.rotation.value(0x6072) == 800
-    # 100 rad/s^2 are 955 rpm/s.
-    bench = DriveBench(rotation_counts_per_turn=65536.0)
+    bench = DriveBench(insertion_counts_per_turn=50_000.0, rotation_counts_per_turn=65536.0)
+    change(bench.insertion, fed(360, 1))
     bench.rotation.set_objects({(0x60A9, 0): RPM, (0x60AA, 0): RPM_S})
     bench.configured()
-    assert bench.rotation.value(0x6085) == 955
+    # 0.5 m/s^2 and 100 rad/s^2 in rpm/s.
+    assert (bench.insertion.value(0x6085), bench.rotation.value(0x6085)) == (12_000, 955)
 
 
 def test_homing_method_35_replaces_37() -> None:
     bench = DriveBench()
-    refuses(RANGE, 0x6098, but=b"\x23")(bench.rotation)
+    change(bench.rotation, refuses(RANGE, 0x6098, but=b"\x23"))
     bench.steps()
     assert bench.rotation.value(0x6098) == 35
 
@@ -275,9 +234,6 @@ def test_axis_without_motor_needs_only_position_units() -> None:
     bench.insertion.set_objects({(0x60A9, 0): 0x0001_0300, (0x60AA, 0): 0})
     bench.configured()
     assert bench.drives.missing_optional_parts == ()
-    bench = DriveBench(insertion_drive="hand")
-    bench.insertion.set_objects({(0x60A8, 0): 0x0001_0000})
-    assert "insertion axis: the drive measures positions in m (0x60A8" in bench.refusal()
 
 
 def test_homing_slower_than_one_speed_unit_is_refused() -> None:
@@ -290,42 +246,6 @@ def test_homing_slower_than_one_speed_unit_is_refused() -> None:
 
 
 # ---- time limits and rounding --------------------------------------------------------------------
-
-
-def stored(index: int, made: int, at: int, value: bytes) -> bytes:
-    """Return the stored value."""
-    return made.to_bytes(len(value), "little") if at == index else value
-
-
-@pytest.mark.parametrize(("seconds", "is_off"), [(0.9, True), (1.1, False)])
-def test_powered_drive_has_a_second_to_switch_off(seconds: float, is_off: bool) -> None:
-    bench = DriveBench()
-    bench.insertion.state = "enabled"
-    bench.sdo_time = 0.02
-    bench.delay_reaction(bench.insertion, seconds)
-    reply = bench.configure()
-    assert (reply.success, "does not switch off" in reply.message) == (is_off, not is_off)
-
-
-@pytest.mark.parametrize(("seconds", "has_it"), [(0.4, True), (0.6, False)])
-def test_drive_has_half_a_second_to_display_an_unlisted_mode(seconds: float, has_it: bool) -> None:
-    bench = DriveBench()
-    drive, due = bench.insertion, math.inf
-
-    def refuses(index: int, _: int, __: bytes) -> int:
-        nonlocal due
-        due = bench.now + seconds if index == 0x6060 else due
-        return 0
-
-    def sending() -> None:
-        drive.mode = 8 if bench.now >= due else 0
-
-    drive.set_objects({(0x6502, 0): 0x225})
-    drive.modes, drive.refuses, bench.bus.sending = set(), refuses, sending
-    bench.sdo_time = 0.02
-    reply = bench.configure()
-    wanted = (True, False) if has_it else (False, True)
-    assert (reply.success, "position mode (0x6060 = 8, 0x6061 = 0)" in reply.message) == wanted
 
 
 @pytest.mark.parametrize(
@@ -341,7 +261,7 @@ def test_drive_may_round_a_bound_but_not_halve_it(
 ) -> None:
     for made, is_taken in ((least, True), (most, True), (least - 1, False), (most + 1, False)):
         bench = DriveBench(**parameter)
-        bench.insertion.stores = partial(stored, index, made)
+        change(bench.insertion, makes(index, wanted, made))
         if is_taken:
             assert bench.configured().insertion.value(index) == made
         else:
@@ -362,13 +282,12 @@ def test_disabled_limits_fit_the_range_of_the_drive() -> None:
 
 def test_drive_that_refuses_its_limits_is_not_switched_on() -> None:
     bench = DriveBench().homing()
-    refuses(RANGE, 0x607D)(bench.insertion)
+    change(bench.insertion, refuses(RANGE, 0x607D))
     bench.wait(30)
-    assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
     bench.reset()
-    assert not bench.enable().success
     with pytest.raises(AxisError, match="insertion axis has no software limits yet"):
         bench.axes[0].power(True)
+    assert not bench.enable().success
     bench.wait()
     assert bench.state == "FAULT"
     assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
@@ -380,5 +299,3 @@ def test_slow_drives_with_few_heartbeats_accept_limits() -> None:
     assert bench.home().success
     bench.wait(30)
     assert (bench.state, bench.is_homed()) == ("DISABLED", True), bench.status.fault
-    assert bench.insertion.value(0x607D, 1) == -20_000
-    assert bench.enable().success

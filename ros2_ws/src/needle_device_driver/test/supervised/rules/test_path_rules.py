@@ -52,42 +52,23 @@ def test_coordinated_path_replaces_another_without_a_stop() -> None:
     while bench.state == "MOVING":
         bench.go()
     assert bench.results == [(first, "replaced"), (second, "succeeded")]
-    # A knot may coincide with the needle position.
-    bench = Bench().ready()
-    path(bench, (-1.0, 0.0), (0.0, 0.2), (1.0, 0.3))
-    bench.go(5)
-    assert bench.positions == pytest.approx((0.0005, 0.15))
 
 
 def test_forward_only_path_that_ends_at_the_needle_moves_nothing() -> None:
     bench = Bench().ready()
     path(bench, (0.0, 0.0), (0.5, 0.1), (1.0, 0.1))
     bench.go(12)
-    for end in (1.0, 1.0009):
-        bench.go()
-        stamp = path(bench, (0.0, 0.0), (0.5, 0.5), (end, 0.5))
-        bench.go(3)
-        assert bench.positions == (0.001, 0.1)
-        assert bench.results[-1] == (stamp, "succeeded")
+    # Up to the tolerance of the axes.
+    stamp = path(bench, (0.0, 0.0), (0.5, 0.5), (1.0009, 0.5))
+    bench.go(3)
+    assert bench.positions == (0.001, 0.1)
+    assert bench.results[-1] == (stamp, "succeeded")
     path(bench, (0.0, 0.0), (0.5, 0.1), (1.0011, 0.1))
     assert bench.state == "MOVING"
 
 
-def test_forward_only_each_point_is_ahead_of_the_previous() -> None:
-    bench = Bench().ready()
-    bench.submit((0.0, 0.0, 0.0), (0.001, 0.0, 0.2), (0.0009, 0.0, 0.4), (0.0015, 0.0, 0.6))
-    why = "insertion 0.9 mm is not ahead of the point before, 1 mm"
-    assert why in bench.refused("forward_only")
-    bench.submit((0.0, 0.0, 0.0), (0.001, 0.0, 0.2), (0.001, 0.0, 0.4), (0.0015, 0.0, 0.6))
-    bench.refused("forward_only")
-    bench.submit((-0.003, 0.0, 0.0), (-0.002, 0.0, 0.2), (-0.001, 0.0, 0.4))
-    bench.refused("forward_only")
-
-
 def test_max_rotation_rate_slows_the_insertion() -> None:
     bench = Bench().ready()
-    path(bench, (0.0, 0.0), (0.5, 0.4), (0.6, 1.1))
-    bench.refused("max_rotation_rate")
     path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
     bench.go(10)
     # The rest of the first leg, 0.05 mm, has a rotation of 0.9 rad.
@@ -104,17 +85,20 @@ def test_max_rotation_rate_slows_the_insertion() -> None:
 @pytest.mark.parametrize(
     ("rule", "points"),
     [
+        ("forward_only", [(0.001, 0.0, 0.2), (0.001, 0.0, 0.4), (0.0015, 0.0, 0.6)]),
         ("max_speed", [(0.0005, 0.0, 0.09), (0.001, 0.0, 0.3), (0.0015, 0.0, 0.5)]),
         ("max_rotation_step", [(0.0005, 0.7, 0.3), (0.001, 1.3, 0.6), (0.0015, 0.7, 0.9)]),
         ("max_rotation_rate", [(0.0005, 0.0, 0.1), (0.001, -0.7, 0.3), (0.0015, -0.7, 0.5)]),
         ("max_turns", [(0.0005, 0.4, 0.3), (0.001, 0.7, 0.6), (0.0015, 0.4, 0.9)]),
         ("max_depth", [(0.001, 0.0, 0.3), (0.0017, 0.0, 0.6)]),
+        ("max_step_length", [(0.001, 0.0, 0.3), (0.0021, 0.0, 0.6)]),
     ],
 )
 def test_each_piece_of_a_path_is_bounded(
     rule: str, points: list[tuple[float, float, float]]
 ) -> None:
-    bench = Bench(max_turns=0.1 if rule == "max_turns" else 10.0, max_depth=0.0016).ready()
+    limits = {"max_turns": {"max_turns": 0.1}, "max_depth": {"max_depth": 0.0016}}
+    bench = Bench(**limits.get(rule, {})).ready()
     bench.submit(*points)
     bench.refused(rule)
 
@@ -127,18 +111,8 @@ def test_command_state_step_and_path_do_not_replace_each_other() -> None:
     assert bench.rule == "command_state"
     bench.go(30)
     path(bench, (1.0, 0.1), (2.0, 0.1), (3.0, 0.1))
-    bench.go(2)
-    stamp = bench.step()
+    stamp = bench.step(stamp_ns=bench.ros_ns + 1)
     assert bench.results[-1] == (stamp, "aborted: the device is MOVING, not HOLDING")
-    assert bench.state == "MOVING"
-
-
-def test_max_step_length_bounds_the_end_of_a_path() -> None:
-    bench = Bench().ready()
-    path(bench, (0.0, 0.0), (1.0, 0.0), (2.0011, 0.0))
-    bench.refused("max_step_length")
-    # The axes may rest anywhere within the tolerance of their set-points.
-    path(bench, (0.001, 0.0), (1.001, 0.0), (2.001, 0.0))
     assert bench.state == "MOVING"
 
 
@@ -155,32 +129,18 @@ def test_tip_age_ends_a_slow_path() -> None:
     assert (bench.state, bench.rule) == ("HOLDING", "tip_age")
     assert "the tip behind the path is 2.000 s old, limit 2 s" in bench.outcomes[-1]
     assert bench.status.watchdog_trips == 1
-    at = bench.positions
-    bench.go(5)
-    assert bench.positions == at
 
 
-@pytest.mark.parametrize("back", [0.3, 3600.0])
-def test_tip_age_ends_a_path_when_time_is_set_back(back: float) -> None:
+def test_tip_age_ends_a_path_when_time_is_set_back() -> None:
     bench = Bench().ready()
     bench.wait(20)
     bench.press()
     straight(bench)
     bench.go(5)
-    bench.ros_ns -= round(back * 1e9)
+    bench.ros_ns -= 300_000_000
     bench.go(2)
     assert (bench.state, bench.rule) == ("HOLDING", "tip_age")
     assert "ahead of this computer's clock" in bench.outcomes[-1]
-
-
-def test_tip_age_path_continues_with_fresh_paths() -> None:
-    bench = Bench().ready()
-    for _ in range(60):
-        here = bench.positions[0] * 1e3
-        path(bench, (here, 0.0), (here + 1.0, 0.0), (here + 1.9, 0.0))
-        bench.go(2, scale=0.05)
-    assert bench.state == "MOVING"
-    assert bench.positions[0] == pytest.approx(60 * 2 * PERIOD * 0.05 * SPEED)
 
 
 def test_tip_age_does_not_end_a_step() -> None:
@@ -203,15 +163,11 @@ def test_settling_time_restarts_with_a_new_path() -> None:
 
 def test_command_form_path_must_not_begin_ahead_of_the_needle() -> None:
     bench = Bench().ready()
-    for ahead in (0.0011, 1.0):
-        path(bench, (ahead, 0.0), (1.1, 0.1), (1.5, 0.1))
-        reason = bench.refused("command_form")
-        assert f"begins at {ahead:.6g} mm, ahead of the needle at 0 mm" in reason
-    path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.3))
-    bench.go(4)
-    path(bench, (0.5, 0.1), (1.0, 0.3), (2.2, 0.3))
-    bench.go(20)
-    assert (bench.rule, bench.positions) == ("command_form", (0.002, 0.3))
+    path(bench, (0.0011, 0.0), (1.1, 0.1), (1.5, 0.1))
+    assert "begins at 0.0011 mm, ahead of the needle at 0 mm" in bench.refused("command_form")
+    # Up to the tolerance of the axes.
+    path(bench, (0.001, 0.0), (1.1, 0.1), (1.5, 0.1))
+    assert bench.state == "MOVING"
 
 
 # ---- an insertion axis that a hand pushes -------------------------------------------------------
