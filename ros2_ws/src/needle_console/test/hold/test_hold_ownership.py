@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from hold_scene import Scene
-from needle_console.hold.hold_protocol import IDLE, OTHER_PAGE, PERIOD, SILENCE
+from needle_console.hold.hold_protocol import IDLE, OTHER_PAGE, PERIOD
 from needle_console.hold.page_session import ECHO_AGE_LIMIT, RELEASED, HoldRefusal, Mode, PageHold
 
 STALLED = "no echo from this page for 0.25 s (browser, network or console stalled)"
@@ -192,12 +192,3 @@ def test_owner_that_holds_is_not_idle(scene: Scene) -> None:
     scene.send(second, False)
     assert scene.send(second, True) is HoldRefusal.BARRED
     assert scene.pressed
-
-
-def test_silent_page_is_lost(scene: Scene, page: int) -> None:
-    scene.wait(SILENCE)
-    assert not scene.protocol.is_silent(page, scene.now)
-    scene.wait(JUST)
-    assert scene.protocol.is_silent(page, scene.now)
-    scene.send(page, False)
-    assert not scene.protocol.is_silent(page, scene.now)

@@ -35,23 +35,6 @@ def test_outdated_joints_are_not_shown() -> None:
     assert readings(picture.snapshot(1.1))["Depth"] == NONE
 
 
-def test_estimates_are_transformed_by_the_current_plane() -> None:
-    (point,) = picture_of(0.05).snapshot(0.0).track
-    assert point.r1 == pytest.approx(-0.002)
-    assert point.position == pytest.approx([0.001, 0.0, 0.05])
-    assert point.sigma == pytest.approx(1e-4)
-    picture = picture_of()
-    picture.set_plane(plane_pose(3.0, 30.0))
-    picture.set_joints(0.05, 0.1, now=0.0)
-    # On the plane, 50 mm along it.
-    picture.add_estimate(np.array([0.0, 0.0, 0.05]), np.diag([0.0, 0.0, 1e-6]))
-    (point,) = picture.snapshot(0.0).track
-    along = np.array([0.5, 0.0, math.sqrt(0.75)])
-    normal = np.array([math.sqrt(0.75), 0.0, -0.5])
-    assert point.position == pytest.approx(0.003 * normal + 0.05 * along)
-    assert point.covariance == pytest.approx(1e-6 * np.outer(along, along))
-
-
 def test_plane_is_shown_only_if_the_controller_accepted_it() -> None:
     picture = picture_of(0.01)
     tilted = plane_pose(9.0, 36.0)
@@ -78,14 +61,6 @@ def test_reason_of_an_ended_hold_is_kept_while_pressed() -> None:
         device = picture.latest().device
         assert device is not None
         assert stop_reason(device) == why
-
-
-def test_missing_controller_is_cleared() -> None:
-    picture = picture_of(0.01)
-    picture.clear_controller()
-    assert picture.latest().controller is None
-    picture.set_controller(STEERING)
-    assert picture.snapshot(0.0).controller == STEERING
 
 
 def test_track_deepens_and_restarts() -> None:
