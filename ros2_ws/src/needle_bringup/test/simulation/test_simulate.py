@@ -24,10 +24,6 @@ from needle_core.status_messages import ControllerStatus
 
 pytestmark = pytest.mark.usefixtures("compiled")
 WORDS = ("--level", "tip", "--depth-mm", "4", "--initial", "0.2,0,0")
-KEYS = {
-    *("level", "controller", "seed", "steps", "converged", "r1_final_mm", "r1_rms_last_20_mm"),
-    *("tip_error_p95_mm", "depth_error_p95_mm", "steps_per_s", "wall_s", "watchdog_trips", "bag"),
-}
 
 
 def record(folder: Path, *argv: str, check: Callable[[], None] = lambda: None) -> bytes:
@@ -54,7 +50,6 @@ def test_a_run_leaves_bag_report_and_summary(ended: tuple[int, Path]) -> None:
     code, folder = ended
     summary = json.loads((folder / "bag" / "summary.json").read_text("utf-8"))
     assert (folder / "result.json").read_text() == (folder / "bag" / "summary.json").read_text()
-    assert set(summary) >= KEYS
     assert (code, summary["converged"], summary["steps"]) == (0, True, 4)
     assert abs(summary["r1_final_mm"]) < 1.0
     for name in ("report.html", "parameters.yaml", "metadata.yaml"):

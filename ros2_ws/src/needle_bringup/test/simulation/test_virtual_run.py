@@ -100,20 +100,6 @@ def test_delayed_components_do_not_end_the_run(insertion: str) -> None:
     assert rig.depth == pytest.approx(0.006, abs=1e-5)
 
 
-def test_motion_stops_when_the_hold_falls_silent() -> None:
-    rig = Rig(*SHORT)
-    rig.until_depth(0.0025)
-    rig.runner.freeze(OPERATOR, 2.0)
-    before = rig.depth
-    rig.runner.run(0.15)
-    stopped = rig.depth
-    rig.runner.run(1.0)
-    # 2 mm/s for at most 0.15 s
-    assert before < stopped <= before + 0.0003
-    assert rig.depth == stopped
-    assert any("no hold message" in outcome for outcome in rig.outcomes)
-
-
 def test_a_tip_that_leaves_the_phantom_ends_the_run() -> None:
     rig = Rig("--level", "tip", "--controller", "open_loop")
     rig.sim_rig._sensor.half_sizes = (1e-3, math.inf)

@@ -12,7 +12,6 @@ from needle_bringup.studies import study_controllers
 from needle_bringup.studies.study_controllers import (
     SteeredNeedles,
     controller_factory,
-    needles_at_a_time,
     point_controller_factory,
 )
 from needle_bringup.studies.study_estimators import BestEstimators, SeparateEstimators
@@ -121,13 +120,10 @@ def test_the_belief_follows_from_the_estimates() -> None:
         # d sin(pitch) = cos(pitch) d pitch, to first order
         to_first_order = np.cos(pitch) * np.sqrt(covariance[4, 4])
         assert belief.sin_pitch_std[n] == pytest.approx(to_first_order, rel=0.02)
-    assert belief.missed is not None
-    assert np.all((belief.missed > 0.0) & (belief.missed < 0.5))
     # The paper's observer uses no covariance.
     paper = controller_factory("paper", 0.001)()
     paper.start(TIPS)
     assert paper.belief() is None
-    assert needles_at_a_time("paper") > needles_at_a_time("best")
 
 
 def test_needles_off_their_target_report_a_miss() -> None:

@@ -44,13 +44,9 @@ def centre(image: np.ndarray) -> np.ndarray:
         {"blur_px": 2.5},
         {"shrink": 0.83},
         {"noise": 6.0, "noise_blur_px": 0.8},
-        {"noise": 6.0, "denoise": "median"},
         {"noise": 6.0, "denoise": "bilateral"},
         {"sharpen": 1.2},
         {"quality": 10},
-        {"haze": 0.4},
-        {"gamma": 0.7},
-        {"gain": 0.4},
     ],
     ids=str,
 )
