@@ -234,18 +234,15 @@ def test_the_player_waits_for_existing_subscribers(scene: Scene) -> None:
     assert begun == [pytest.approx(end, abs=0.2)]
 
 
-def test_unplayable_bags_give_a_one_line_error(
+def test_bags_without_the_chosen_messages_are_refused(
     scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for options, words in {
         "--topics nonsense": "/nonsense is not in",
         "--start 30": "--start 30 s",
-        "--rate fast": "invalid float value",
         "--regex (": "is not a regular expression",
         "--regex nonsense": "no topic is chosen; it has /plane",
         "--topics odd": "none of its topics can be played",
     }.items():
         assert scene.play(options) == 2
-        errors = capsys.readouterr().err
-        assert words in errors
-        assert errors.count("\n") == 1
+        assert words in capsys.readouterr().err

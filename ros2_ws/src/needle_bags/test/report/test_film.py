@@ -4,8 +4,6 @@ import base64
 import dataclasses
 import json
 import re
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -15,15 +13,13 @@ import pytest
 from needle_bags.figures.film import (
     MAX_BYTES,
     MAX_FRAMES,
-    READINGS,
     _small_jpeg,
-    camera_views,
     film_of,
     plan_views,
     projections,
 )
 from needle_bags.reading.bag_images import images_at
-from needle_bags.reading.bag_reader import Run, Series, read_run
+from needle_bags.reading.bag_reader import Run, Series
 
 STEP_NS = 520_000_000
 
@@ -66,14 +62,6 @@ def test_a_resting_needle_takes_no_frames(made_up: Run) -> None:
     assert film_of(with_depth(made_up, there_and_back))[-1].stamp == made_up.tips.stamps[-1]
 
 
-def test_readings_belong_to_their_frame(made_up: Run) -> None:
-    readings = dict(zip(READINGS, film_of(made_up)[-1].readings, strict=True))
-    assert list(readings.values()) == [
-        *("120.0 mm", "-0.25 mm", "-0.15 mm", readings["Pitch, estimated"], "+1 deg"),
-        f"{np.degrees(12.0):.0f} deg",
-    ]
-
-
 def test_the_drawings_are_to_scale(made_up: Run) -> None:
     frames = film_of(made_up)
     side, above = plan_views(made_up, frames)
@@ -87,19 +75,6 @@ def test_the_drawings_are_to_scale(made_up: Run) -> None:
             assert np.allclose(slope * metres + offset, pixels, atol=1e-6)
         assert ends.min() > 0.0
         assert np.all(ends < np.array(view.size))
-
-
-def test_the_film_has_the_images_in_order(make_run: Callable[..., Path]) -> None:
-    run = read_run(make_run(image_height=3, steps=60, bad_tip=30))
-    frames = film_of(run)
-    # A NaN tip draws no needle.
-    assert [len(frames[k].shaft) > 0 for k in (29, 30, 31)] == [True, False, True]
-    views = camera_views(run, frames)
-    assert len(views) == 2
-    for view in views:
-        shades = [np.median(decoded(data)) for data in view.pictures]
-        # The brightness of a made-up image is its number.
-        assert np.abs(np.array(shades) - np.arange(MAX_FRAMES)).max() <= 2.0
 
 
 def test_the_film_marks_the_tip_in_camera_images(
@@ -128,7 +103,7 @@ def test_the_film_marks_the_tip_in_camera_images(
     assert len(page) < 6e6
 
 
-@pytest.mark.parametrize("shape", [(768, 1024), (2000, 300), (7, 5)])
+@pytest.mark.parametrize("shape", [(2000, 300), (7, 5)])
 def test_a_picture_of_noise_is_small(shape: tuple[int, int]) -> None:
     noise = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
     data = _small_jpeg(noise)
