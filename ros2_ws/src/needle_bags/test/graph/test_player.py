@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -79,14 +78,7 @@ class Scene(PlayedGraph):
     def __init__(self, monkeypatch: pytest.MonkeyPatch, bag: Path) -> None:
         super().__init__(monkeypatch, node)
         self.bag = bag
-        self.ended = SimpleNamespace(requested=False)
-
-        def run_node(create: Any, *, spin: Any, args: list[str], **_: object) -> int:
-            return int(spin(create(), self.ended))
-
-        monkeypatch.setattr(node, "run_node", run_node)
-        monkeypatch.setattr(node, "NodeParameters", lambda *_: None)
-        monkeypatch.setattr(node, "SingleThreadedExecutor", self.executor)
+        self.host(monkeypatch, node)
 
     def play(self, options: str = "") -> int:
         return node.main(["player", str(self.bag), *options.split()])
@@ -162,7 +154,7 @@ def test_latched_messages_are_available_while_paused_and_loops_repeat(scene: Sce
         assert scene.pause(False) == "playing"
 
     def stop() -> None:
-        scene.ended.requested = True
+        scene.end.requested = True
 
     scene.at(9.0, begin)
     scene.at(9.0 + 2.5 * (COUNT - 5), stop)

@@ -100,21 +100,6 @@ def test_the_controller_is_configured_for_the_sensor_of_its_level() -> None:
     assert "tip_noise" not in nodes_for()["plane_controller"]
 
 
-def test_the_launched_rig_is_that_of_simulate() -> None:
-    # Beyond the defaults, simulate sets only what the command line gives, recording, and the
-    # emulated adapter: none of these describe the rig.
-    of_run = {"level", "seed", "preset"}
-    of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
-    set_by_simulate = {
-        node: set(values) - of_run for node, values in nodes_for("--level drive").items()
-    }
-    assert set_by_simulate["sim_rig"] == of_needle
-    assert set_by_simulate["plane_controller"] == {"depth", "target_offset"}
-    assert set_by_simulate["stereo_tracker"] == set()
-    assert SteeringSettings().tip_covariance == "from_tip_pose"
-    assert parse([]).depth_mm == pytest.approx(SteeringSettings().depth * 1e3)
-
-
 def test_later_layers_replace_single_parameters() -> None:
     layers: list[Parameters] = [{"sim_rig": {"level": "tip", "seed": 2}}, {"sim_rig": {"seed": 3}}]
     merged = merge(*layers, {"console": {}})
@@ -143,6 +128,7 @@ def test_the_defaults_of_a_needle_are_those_of_the_nodes() -> None:
             else:
                 assert default == shared.default
     assert SimRigParameters().pre_bend == pytest.approx(PRE_BEND)
+    assert SimulateOptions().depth_mm == pytest.approx(SteeringSettings().depth * 1e3)
     assert contradictions({}, NODES) == []
 
 

@@ -15,12 +15,11 @@ from needle_bringup.studies.study_controllers import (
     point_controller_factory,
 )
 from needle_bringup.studies.study_estimators import BestEstimators, SeparateEstimators
-from needle_bringup.studies.study_laws import each_rate, planned_law
+from needle_bringup.studies.study_laws import each_rate
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.arrays import Array
-from needle_controller.model.target_motion import TargetMotion
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import SteeringSettings
 
@@ -141,18 +140,3 @@ def test_needles_off_their_target_report_a_miss() -> None:
         assert belief is not None
         assert belief.missed is not None
         assert belief.missed[0] < 0.8 < 0.95 < belief.missed[1]
-
-
-def test_a_planned_path_is_followed_and_without_one_the_needle_stops() -> None:
-    motion = TargetMotion()
-    needle, settings = (
-        HypothesisFilter(FilterSettings()),
-        SteeringSettings(depth=0.2, entry_angle_std=math.radians(2.0)),
-    )
-    needle.reset(np.zeros(3), np.zeros(2))
-    for target, has_a_way in (([0.004, 0.0, 0.08], True), ([0.05, 0.0, 0.02], False)):
-        motion.observe(motion.last_time + 1.0 if target[0] > 0.01 else 0.0, np.array(target))
-        command = planned_law(motion, settings)(needle.estimate(), 0.0, 0.0, math.inf)
-        assert command.insertion_left is not None
-        assert (command.insertion_left > 0.079) is has_a_way
-        assert (command.insertion_left == -math.inf) is not has_a_way

@@ -12,7 +12,7 @@ from needle_bringup.training.needle_ends import (
     true_map,
 )
 from needle_bringup.training.patches import patch
-from needle_bringup.training.samples import CANVAS, moved
+from needle_bringup.training.samples import CANVAS
 
 SIZE = 96
 
@@ -45,14 +45,6 @@ def test_a_needle_slides_along_its_own_curve() -> None:
     assert np.maximum(shorter - whole, 0.0).sum() < 0.03 * shorter.sum()
     back = pose.slid(-20.0).slid(20.0)
     assert np.hypot(back.x - pose.x, back.y - pose.y) < 0.5
-
-
-def test_an_image_is_shifted_by_the_distance() -> None:
-    image = np.zeros((40, 40), np.float32)
-    image[20, 20] = 100.0
-    there = moved(image, 3.0, 0.0)
-    assert there[20, 23] == pytest.approx(100.0)
-    assert there[20, 20] == 0.0
 
 
 def test_patches_repeat_by_their_seed() -> None:

@@ -71,20 +71,6 @@ def test_a_sample_and_its_labels_are_rotated_and_scaled_together(width_px: float
     assert ends > 5
 
 
-def test_half_of_the_samples_have_a_background_of_the_same_camera() -> None:
-    scene = bars(4.0)
-    samples = [traced_patch(np.random.default_rng(seed), [scene]) for seed in range(60)]
-    known = [sample for sample in samples if sample.background is not None]
-    assert 20 < len(known) < 50
-    # Where there is more needle than before, the image has changed.
-    differences = [
-        np.abs(sample.image.astype(float) - sample.background)[sample.share > 250].mean()
-        for sample in known
-        if sample.background is not None and (sample.share > 250).sum() > 60
-    ]
-    assert np.median(differences) > 20.0
-
-
 def test_the_width_of_a_shaft_is_that_of_its_outline() -> None:
     line = np.linspace([0.0, 0.0, 0.001], [0.003, -0.004, 0.06], 200)
     ahead = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
