@@ -100,16 +100,6 @@ def test_a_rejected_plane_is_ignored() -> None:
     assert needle.target_point is None
 
 
-def test_without_a_tip_the_last_one_is_kept() -> None:
-    needle: Any = LiveNeedle()
-    assert [needle.shaft] == [None]
-    needle.set_insertion(0.02)
-    needle.add_tip(MeasuredTip(100, arc(0.02), UPRIGHT, np.eye(3)))
-    needle.add_missing_tip(200)
-    assert (needle.answered_ns, needle.tip_found) == (200, False)
-    assert needle.shaft[-1] == pytest.approx(arc(0.02))
-
-
 def pose(insertion: float) -> NDArray[np.float64]:
     """Pose of the tip on the circle."""
     matrix = np.eye(4)

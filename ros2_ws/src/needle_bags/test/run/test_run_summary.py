@@ -44,14 +44,6 @@ def test_a_stopped_run_has_not_converged(make_run: MakeRun) -> None:
     assert summary["tips_not_finite"] == 1
 
 
-def test_without_truth_its_figures_are_null(made_up: Run) -> None:
-    nothing = Series(*(part[:0] for part in dataclasses.astuple(made_up.truth)))
-    summary = summarize(dataclasses.replace(made_up, truth=nothing))
-    for key in ("r1_final_mm", "r1_rms_last_20_mm", "tip_error_p95_mm", "depth_error_p95_mm"):
-        assert summary[key] is None
-    assert (summary["converged"], summary["steps"]) == (False, 120)
-
-
 def test_commanded_rotations_start_at_the_measured_one(made_up: Run) -> None:
     commands = made_up.joints.values + np.array([1e-3, 0.25])
     commands = dataclasses.replace(made_up.joints, values=commands)

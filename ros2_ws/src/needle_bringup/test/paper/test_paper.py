@@ -19,10 +19,8 @@ from needle_bringup.paper.paper_results import (
     Laboratory,
     settled_mm,
 )
-from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_bringup.workplace import checkout
 from needle_core.commands.cli import JsonValue
-from needle_core.errors import UserError
 
 COUNT = 400
 FIGURES: dict[str, JsonValue] = {
@@ -38,16 +36,6 @@ def test_settled_is_the_last_entry_into_the_band() -> None:
     assert settled_mm(insertion, np.array([3.0, 2.0, 0.5, 1.5, 1.0, 0.0])) == 4.0
     assert settled_mm(insertion, np.zeros(6)) == 0.0
     assert settled_mm(insertion, np.full(6, 2.0)) == np.inf
-
-
-def test_a_trial_is_a_simulation_with_a_bag_in_the_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[SimulateOptions] = []
-    monkeypatch.setattr(paper_results, "simulate", asked.append)
-    with pytest.raises(UserError, match="no such bag"):
-        Laboratory(tmp_path).trial("one", "--level", "tip")
-    assert (asked[0].level, asked[0].bag) == ("tip", tmp_path / "one")
 
 
 @functools.cache
