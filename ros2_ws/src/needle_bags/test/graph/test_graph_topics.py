@@ -83,6 +83,21 @@ def test_a_replaced_subscription_delivers_its_queue_before_its_end(graph: Graph)
     assert graph.numbers == [1, 2, 3]
 
 
+def test_a_third_subscription_keeps_the_messages_of_the_first_two(graph: Graph) -> None:
+    before, following = graph.replace()
+    graph.receive(before, 1)
+    graph.receive(following, 2)
+    graph.offers[JOINTS].pop()
+    graph.topics.poll()
+    assert graph.subscriptions[0] is following
+    third = graph.subscriptions[1]
+    following.waiting.append(sent(3))
+    graph.receive(third, 3, 4)
+    graph.now += OVERLAP + 0.1
+    graph.topics.poll()
+    assert (graph.numbers, graph.subscriptions) == ([1, 2, 3, 4], [third])
+
+
 def test_the_strictest_qos_of_all_publishers_is_requested(
     graph: Graph,
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import struct
 import sys
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from needle_bags.link.link_port import LinkPort
 from needle_bags.link.openigtlink import (
     LINK,
     Listeners,
@@ -133,6 +135,15 @@ def test_the_port_reports_clients_and_without_any_nothing_is_packed() -> None:
         assert isinstance(health, Diagnose)
         assert health.diagnostic.level is level
         assert text in health.diagnostic.message
+
+
+def test_the_port_sends_batches_and_reports_its_clients() -> None:
+    arrived: list[Any] = []
+    with contextlib.closing(LinkPort("127.0.0.1", 0)) as port:
+        port.open(arrived.append)
+        port.send((b"needle",))
+        log = Log("info", f"shows the needle at 127.0.0.1, port {port.port}")
+        assert arrived == [(log,), (Listeners(0),)]
 
 
 # Message name, its points in mm, and the proposed target in mm or the warning.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -89,7 +90,8 @@ def numbers(path: Path) -> list[int]:
         with (path / name).open("rb") as stream:
             indexed += [m.data for _, _, m in make_reader(stream, True).iter_messages()]
     assert found == indexed
-    return [STORE.deserialize_cdr(data, TYPE).layout.data_offset for data in found]  # type: ignore[attr-defined]
+    messages: list[Any] = [STORE.deserialize_cdr(data, TYPE) for data in found]
+    return [one.layout.data_offset for one in messages]
 
 
 def chunks(file: Path) -> list[ChunkIndex]:

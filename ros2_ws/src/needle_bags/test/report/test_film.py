@@ -13,6 +13,7 @@ import pytest
 from needle_bags.figures.film import (
     MAX_BYTES,
     MAX_FRAMES,
+    READINGS,
     _small_jpeg,
     film_of,
     plan_views,
@@ -30,6 +31,11 @@ def decoded(data: bytes) -> np.ndarray:
     return np.asarray(image)
 
 
+def with_depth(run: Run, depth: np.ndarray) -> Run:
+    values = np.column_stack([depth, run.joints.values[:, 1]])
+    return dataclasses.replace(run, joints=dataclasses.replace(run.joints, values=values))
+
+
 def test_frames_are_equally_spaced_and_end_at_their_tip(made_up: Run) -> None:
     frames = film_of(made_up)
     assert [frame.stamp for frame in frames] == [2 * STEP_NS * n for n in range(MAX_FRAMES)]
@@ -44,6 +50,25 @@ def test_frames_are_equally_spaced_and_end_at_their_tip(made_up: Run) -> None:
         assert np.array_equal(frame.shaft[-1], tip)
         # Without ground truth, the measured tip is shown.
         assert np.array_equal(measured.needle, frame.shaft)
+
+
+def test_a_resting_needle_takes_no_frames(made_up: Run) -> None:
+    run = with_depth(made_up, np.minimum(made_up.joints.values[:, 0], 0.1))
+    frames = film_of(run)
+    insertions = run.insertion_at(np.array([frame.stamp for frame in frames]))
+    assert insertions.max() <= 0.1 + 1e-9
+    assert len(frames) > MAX_FRAMES // 2
+    # A withdrawal is part of the film.
+    there_and_back = 0.06 - np.abs(made_up.joints.values[:, 0] - 0.06)
+    assert film_of(with_depth(made_up, there_and_back))[-1].stamp == made_up.tips.stamps[-1]
+
+
+def test_readings_belong_to_their_frame(made_up: Run) -> None:
+    readings = dict(zip(READINGS, film_of(made_up)[-1].readings, strict=True))
+    assert list(readings.values()) == [
+        *("120.0 mm", "-0.25 mm", "-0.15 mm", readings["Pitch, estimated"], "+1 deg"),
+        f"{np.degrees(12.0):.0f} deg",
+    ]
 
 
 def test_the_drawings_are_to_scale(made_up: Run) -> None:

@@ -81,6 +81,10 @@ def square(number: int) -> int:
     return number**2
 
 
+def test_results_are_in_the_order_of_the_parts(dask: Dask) -> None:
+    assert list(on_cluster(ADDRESS, square, range(5))) == [0, 1, 4, 9, 16]
+
+
 def test_cluster_errors_are_one_line(dask: Dask, monkeypatch: pytest.MonkeyPatch) -> None:
     def refusal(*parts: int, address: str = ADDRESS) -> str:
         with pytest.raises(UserError) as error:

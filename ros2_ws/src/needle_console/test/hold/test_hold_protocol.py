@@ -46,6 +46,7 @@ def test_hold_lasts_while_echoed_and_ends_with_silence(scene: Scene, page: int) 
         assert scene.send(page, True) is None
     scene.wait(ECHO_AGE_LIMIT + JUST)
     assert not scene.pressed
+    assert scene.message_to(page)["why"] == STALLED
     # A continued press does not count, and the first reason stays.
     for _ in range(10):
         assert scene.send(page, True) is HoldRefusal.NEW_PRESS
