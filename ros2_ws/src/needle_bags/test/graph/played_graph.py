@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace as Stub
@@ -33,21 +34,16 @@ def sent(number: int, data: bytes = b"", time_ns: int = 1) -> Taken:
     return data or str(number).encode(), info
 
 
-class PlayedSubscription:
+class PlayedSubscription(contextlib.nullcontext[None]):
     """Subscription whose queue the test fills."""
 
     def __init__(
         self, topic: str, callback: Callable[..., None], qos: QoSProfile, lost: Any
     ) -> None:
+        super().__init__()
         self.topic, self.callback, self.qos_profile, self.lost = topic, callback, qos, lost
         self.waiting: deque[Taken] = deque()
         self.handle = self
-
-    def __enter__(self) -> None:
-        """Do nothing: there is no handle to hold."""
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing."""
 
     def take_message(self, *_: object) -> Taken | None:
         return self.waiting.popleft() if self.waiting else None
@@ -92,6 +88,7 @@ class PlayedGraph:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *modules: Any) -> None:
         self.now, self.name = 1000.0, "ours"
+        self.end = Stub(requested=False)
         self.types: dict[str, str] = {}
         self.offers: dict[str, list[Any]] = defaultdict(list)
         self.requests: dict[str, list[Any]] = defaultdict(list)
@@ -215,10 +212,17 @@ class PlayedGraph:
                 timer[0] += timer[1]
                 timer[2]()
 
-    def executor(self) -> Any:
-        """Return an executor that spends the whole timeout of each turn."""
+    def host(self, monkeypatch: pytest.MonkeyPatch, module: Any, parameters: Any = None) -> None:
+        """Make `main` of a node's module run in this graph, until the end is requested."""
 
         def spin_once(timeout: float = 0.0, *, timeout_sec: float = 0.0) -> None:
+            # Each turn of the executor takes the whole timeout.
             self.run(timeout + timeout_sec)
 
-        return Stub(add_node=lambda _: None, spin_once=spin_once)
+        def run_node(create: Callable[[], Any], *, spin: Any, **_: object) -> int:
+            return int(spin(create(), self.end))
+
+        executor = Stub(add_node=lambda _: None, spin_once=spin_once)
+        monkeypatch.setattr(module, "SingleThreadedExecutor", lambda: executor)
+        monkeypatch.setattr(module, "run_node", run_node)
+        monkeypatch.setattr(module, "NodeParameters", lambda *_: Stub(values=parameters))

@@ -57,15 +57,6 @@ def test_a_lost_request_is_repeated_and_a_late_answer_accepted(bench: Bench) -> 
     assert bench.snapshots.document()[OTHER] == {"ros__parameters": VALUES}
 
 
-def test_a_slow_node_is_asked_ever_less_often_until_it_disappears(bench: Bench) -> None:
-    for _ in range(100):
-        bench.waits()
-    assert len(bench.clients[0].pending) == 7
-    del bench.parameters[OTHER]
-    bench.snapshots.poll()
-    assert bench.clients == []
-
-
 def test_changes_are_those_after_the_snapshot(bench: Bench) -> None:
     def event(**values: object) -> ParameterEvent:
         message = ParameterEvent(node=OTHER)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -79,14 +78,7 @@ class Scene(PlayedGraph):
     def __init__(self, monkeypatch: pytest.MonkeyPatch, bag: Path) -> None:
         super().__init__(monkeypatch, node)
         self.bag = bag
-        self.ended = SimpleNamespace(requested=False)
-
-        def run_node(create: Any, *, spin: Any, args: list[str], **_: object) -> int:
-            return int(spin(create(), self.ended))
-
-        monkeypatch.setattr(node, "run_node", run_node)
-        monkeypatch.setattr(node, "NodeParameters", lambda *_: None)
-        monkeypatch.setattr(node, "SingleThreadedExecutor", self.executor)
+        self.host(monkeypatch, node)
 
     def play(self, options: str = "") -> int:
         return node.main(["player", str(self.bag), *options.split()])
@@ -162,7 +154,7 @@ def test_latched_messages_are_available_while_paused_and_loops_repeat(scene: Sce
         assert scene.pause(False) == "playing"
 
     def stop() -> None:
-        scene.ended.requested = True
+        scene.end.requested = True
 
     scene.at(9.0, begin)
     scene.at(9.0 + 2.5 * (COUNT - 5), stop)
@@ -234,18 +226,15 @@ def test_the_player_waits_for_existing_subscribers(scene: Scene) -> None:
     assert begun == [pytest.approx(end, abs=0.2)]
 
 
-def test_unplayable_bags_give_a_one_line_error(
+def test_bags_without_the_chosen_messages_are_refused(
     scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for options, words in {
         "--topics nonsense": "/nonsense is not in",
         "--start 30": "--start 30 s",
-        "--rate fast": "invalid float value",
         "--regex (": "is not a regular expression",
         "--regex nonsense": "no topic is chosen; it has /plane",
         "--topics odd": "none of its topics can be played",
     }.items():
         assert scene.play(options) == 2
-        errors = capsys.readouterr().err
-        assert words in errors
-        assert errors.count("\n") == 1
+        assert words in capsys.readouterr().err

@@ -6,7 +6,6 @@ import errno
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from mcap.writer import Writer
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
-from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.interfaces import QosReliability
 from std_msgs.msg import Int32, String
 from std_srvs.srv import Trigger
 
@@ -63,25 +62,17 @@ class Scene(PlayedGraph):
 
         monkeypatch.setattr(node, "open_recording", begin)
         monkeypatch.setattr(node, "commit", lambda: "0123abc")
-        self._patch = partial(monkeypatch.setattr, node)
+        self._host = partial(self.host, monkeypatch, node)
 
     def record(self, act: Callable[[], None], **settings: Any) -> int:
         """Run the executable; call `act` between its start and the signal."""
-        values = RecorderParameters(bag=str(self.bag), reserve=0, **settings)
-        self._patch("NodeParameters", lambda *_: SimpleNamespace(values=values))
-        ended = SimpleNamespace(requested=False)
+        self._host(RecorderParameters(bag=str(self.bag), reserve=0, **settings))
 
         def act_and_end() -> None:
             act()
-            ended.requested = True
+            self.end.requested = True
 
         self.at(0.3, act_and_end)
-
-        def run_node(create: Any, *, spin: Any, **_: object) -> int:
-            return int(spin(create(), ended))
-
-        self._patch("run_node", run_node)
-        self._patch("SingleThreadedExecutor", self.executor)
         return node.main()
 
     def health(self, part: str) -> DiagnosticStatus:
@@ -130,9 +121,9 @@ def test_the_bag_has_all_messages_and_what_a_rerun_needs(
     assert scene.numbers("/numbered") == list(range(200))
     assert scene.numbers("/rig/late") == [1, 2]
     contents = read_contents(scene.bag)
-    qos = {name: topic.offered_qos[0] for name, topic in contents.topics.items()}
-    assert qos["/state"].durability is QosDurability.TRANSIENT_LOCAL
-    assert qos["/rig/late"].reliability is QosReliability.BEST_EFFORT
+    assert contents.topics["/state"].is_latched
+    (qos,) = contents.topics["/rig/late"].offered_qos
+    assert qos.reliability is QosReliability.BEST_EFFORT
     custom = contents.custom_data
     assert custom["run_info"] == "seed: 4"
     assert yaml.safe_load(custom["parameters"])["/source"] == {"ros__parameters": {"gain": 1.5}}
@@ -227,15 +218,3 @@ def test_topic_selection_and_invalid_parameters() -> None:
     for name, value in refused.items():
         with pytest.raises(UserError, match=r"regular expression|names|lz4|= 10"):
             RecorderParameters(**{name: value})
-
-
-def test_a_recorder_that_cannot_start_leaves_a_complete_bag(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(*_: object) -> None:
-        raise RuntimeError("no graph")
-
-    monkeypatch.setattr(node, "ParameterSnapshots", broken)
-    with pytest.raises(RuntimeError, match="no graph"):
-        scene.record(lambda: None)
-    assert not read_contents(scene.bag).counts

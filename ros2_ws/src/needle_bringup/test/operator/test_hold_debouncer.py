@@ -45,9 +45,13 @@ def counts(seen: list[tuple[InputReading, float]]) -> HoldKind:
     return HoldKind.NOTHING
 
 
+def stops(reading: InputReading) -> bool:
+    return isinstance(reading, InputState) and reading.stop
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.lists(moments, min_size=1, max_size=30))
-def test_only_a_new_press_from_neutral_is_accepted(seen: list[tuple[InputReading, float]]) -> None:
+def test_only_a_new_press_is_accepted(seen: list[tuple[InputReading, float]]) -> None:
     debouncer, now = HoldDebouncer(), 0.0
     # There is no gap before the first reading.
     seen[0] = (seen[0][0], 0.0)
@@ -56,29 +60,8 @@ def test_only_a_new_press_from_neutral_is_accepted(seen: list[tuple[InputReading
         decision = debouncer.update(reading, now)
         assert decision.kind is counts(seen[: number + 1])
         assert bool(decision.problem) is isinstance(reading, InputLost)
-
-
-def test_a_stop_is_requested_once_per_press_also_after_a_loss_and_ends_the_hold() -> None:
-    press = InputState(stop=True)
-    stories: tuple[tuple[list[InputReading], list[int], list[int]], ...] = (
-        ([NEUTRAL, INSERT, STOPPED, STOPPED, INSERT, NEUTRAL, press], [2, 6], [1]),
-        ([press, InputLost("unplugged"), press, press], [0, 2], []),
-    )
-    for readings, stops, held in stories:
-        debouncer = HoldDebouncer()
-        decisions = [debouncer.update(one, CYCLE * n) for n, one in enumerate(readings)]
-        assert [n for n, one in enumerate(decisions) if one.stop] == stops
-        assert [n for n, one in enumerate(decisions) if one.kind is HoldKind.INSERT] == held
-
-
-def test_a_suspended_process_requires_a_new_press() -> None:
-    debouncer = HoldDebouncer()
-    debouncer.update(NEUTRAL, 0.0)
-    for number, speed in enumerate((0.2, 0.0, 1.0), start=1):
-        decision = debouncer.update(InputState(insert=True, speed=speed), number * 0.99 * MAX_GAP)
-        assert (decision.kind, decision.speed) == (HoldKind.INSERT, speed)
-    frozen = debouncer.update(INSERT, 4.1 * MAX_GAP)
-    assert (frozen.kind, frozen.ignored_press) == (HoldKind.NOTHING, True)
+        stopped_before = number > 0 and stops(seen[number - 1][0])
+        assert decision.stop is (stops(reading) and not stopped_before)
 
 
 class Joystick(JoySource):

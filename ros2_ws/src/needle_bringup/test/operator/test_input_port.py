@@ -193,9 +193,8 @@ def test_an_axis_sets_the_speed_up_to_the_scale() -> None:
 
 
 def test_a_file_that_is_not_an_input_device_is_rejected() -> None:
-    for path in ("/dev/null", "/dev/input/that_is_not_there"):
-        with pytest.raises(OSError, match=r"no input device|No such file"):
-            InputDevice(path)
+    with pytest.raises(OSError, match="no input device"):
+        InputDevice("/dev/null")
 
 
 def test_ioctls_of_an_input_device(monkeypatch: pytest.MonkeyPatch) -> None:

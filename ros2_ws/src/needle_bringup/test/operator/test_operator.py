@@ -127,12 +127,6 @@ def test_the_controller_is_stopped_before_a_withdrawal() -> None:
     assert scene.called == [STOP_STEERING, RETRACT]
     assert scene.update(OUT, hold_owner="operator", activity="retraction").pressed
     assert not scene.update(OUT, activity="none").pressed
-    scene.update()
-    for _ in range(60):
-        scene.update(OUT)
-    # The device ignores the hold.
-    assert not scene.holds[-1].pressed
-    assert "not withdrawn: the device ignores the hold" in scene.logs[-1]
 
 
 def test_a_new_speed_is_applied_and_the_end_releases() -> None:
@@ -145,15 +139,12 @@ def test_a_new_speed_is_applied_and_the_end_releases() -> None:
 
 
 def test_invalid_parameters_are_rejected() -> None:
-    refused: list[tuple[dict[str, Any], str]] = [
-        ({"key": -1}, "key = -1"),
+    refused: tuple[tuple[dict[str, Any], str], ...] = (
         ({"device": ""}, "device = ''"),
         ({"speed_axis": 2}, "a pedal has none"),
         ({"stop_key": 48}, "not all different"),
         ({"axis_at_zero": 1.0}, "are both 1.0"),
-        ({"key": 0x300}, "key"),
-        ({"source": "terminal"}, "source"),
-    ]
+    )
     for values, cause in refused:
         with pytest.raises(UserError, match=cause):
             dataclasses.replace(PEDAL, **values)

@@ -14,19 +14,13 @@ import pytest
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_bringup.paper import paper_results
 from needle_bringup.paper.paper import main
-from needle_bringup.paper.paper_figures import common_r1, converged_share
 from needle_bringup.paper.paper_results import (
     Columns,
-    Floats,
     Laboratory,
-    SteeringTrial,
-    missed_later,
     settled_mm,
 )
-from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_bringup.workplace import checkout
 from needle_core.commands.cli import JsonValue
-from needle_core.errors import UserError
 
 COUNT = 400
 FIGURES: dict[str, JsonValue] = {
@@ -37,11 +31,6 @@ FIGURES: dict[str, JsonValue] = {
 }
 
 
-def trial(insertion_mm: Floats, r1_mm: Floats) -> SteeringTrial:
-    states = np.column_stack([r1_mm, np.zeros((len(r1_mm), 2))])
-    return SteeringTrial(insertion_mm, r1_mm, states, states, np.zeros(len(r1_mm)))
-
-
 def test_settled_is_the_last_entry_into_the_band() -> None:
     insertion = np.arange(6.0)
     assert settled_mm(insertion, np.array([3.0, 2.0, 0.5, 1.5, 1.0, 0.0])) == 4.0
@@ -49,56 +38,8 @@ def test_settled_is_the_last_entry_into_the_band() -> None:
     assert settled_mm(insertion, np.full(6, 2.0)) == np.inf
 
 
-def test_missed_runs_are_evaluated_again_farther_in() -> None:
-    runs = {"r1_final_mm": np.array([0.5, -1.5, 3.0, 1.2])}
-    longer = {"r1_final_mm": np.array([5.0, 0.2, -2.0, 0.9])}
-    # the first had not missed: its later part does not count
-    assert missed_later(runs, longer) == (3, 1, 2.0)
-    assert missed_later({"r1_final_mm": np.zeros(2)}, {"r1_final_mm": np.zeros(2)}) == (0, 0, 0.0)
-
-
-def test_trials_are_averaged_over_their_common_range() -> None:
-    one = trial(np.arange(11.0), np.arange(11.0))
-    other = trial(np.arange(0.0, 9.0, 2.0), np.zeros(5))
-    insertion, r1 = common_r1([one, other])
-    np.testing.assert_allclose(insertion, np.arange(9.0))
-    np.testing.assert_allclose(r1.mean(axis=0), np.arange(9.0) / 2.0)
-    runs = {
-        "x_mm": np.array([-15.0, -15.0, 15.0]),
-        "roll_deg": np.array([-45.0, -45.0, 45.0]),
-        "r1_final_mm": np.array([0.0, 2.0, -1.0]),
-    }
-    shares = converged_share(runs, "roll_deg", 90.0, cells=2)
-    np.testing.assert_allclose(shares, [[0.5, np.nan], [np.nan, 1.0]])
-
-
-def test_a_trial_is_a_simulation_with_a_bag_in_the_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[SimulateOptions] = []
-    monkeypatch.setattr(paper_results, "simulate", asked.append)
-    with pytest.raises(UserError, match="no such bag"):
-        Laboratory(tmp_path).trial("one", "--level", "tip")
-    assert (asked[0].level, asked[0].bag) == ("tip", tmp_path / "one")
-
-
-def test_bad_arguments_give_a_one_line_error_and_exit_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("", "utf-8")
-    for argv, cause in (
-        (["--seed", "-1"], "--seed"),
-        (["--json", "/nowhere/f.json"], "/nowhere/f.json"),
-        (["--out", str(tmp_path / "file")], "--out"),
-    ):
-        assert main(argv) == 2
-        captured = capsys.readouterr()
-        assert len(captured.err.strip().splitlines()) == 1
-        assert cause in captured.err
-
-
 @functools.cache
-def a_run() -> Run:
+def committed_run() -> Run:
     return read_run(checkout() / "bags" / "regression")
 
 
@@ -106,7 +47,7 @@ class MadeUpLaboratory(Laboratory):
     """Laboratory whose trials are all one bag, and whose studies have the same runs."""
 
     def trial(self, name: str, *arguments: str) -> Run:
-        return a_run()
+        return committed_run()
 
     def study(self, name: str, *arguments: str) -> tuple[dict[str, JsonValue], Columns]:
         rng = np.random.default_rng(0)
@@ -117,6 +58,8 @@ class MadeUpLaboratory(Laboratory):
             "r1_final_mm": rng.uniform(-0.9, 0.9, COUNT),
         }
         columns["r1_final_mm"][:4] = 0.5 if "240" in arguments else 1.5
+        # Had not missed before: its later part does not count.
+        columns["r1_final_mm"][4] = 3.0 if "240" in arguments else 0.5
         columns["r1_final_mm"][0] = -2.0
         return FIGURES, columns
 

@@ -21,9 +21,8 @@ from needle_core.settings.parameter_files import Parameters
 
 
 def simulated(**arguments: str) -> Parameters:
-    default = dict.fromkeys(("bag", "params"), "") | {"can": "/tmp/needle_can"}
-    default |= {"level": "camera", "seed": "1", "controller": "best", "simulated_operator": "false"}
-    return simulated_nodes({**default, **arguments})
+    default = {"level": "camera", "seed": "1", "controller": "best", "simulated_operator": "false"}
+    return simulated_nodes({"bag": "", "params": "", "can": "/tmp/c", **default, **arguments})
 
 
 def alongside_rig(**arguments: str) -> Parameters:
@@ -46,18 +45,12 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
     for start, arguments, cause in (
         (alongside_rig, {"drives": typo}, "drives:=.*typo.yaml: no such file"),
         (alongside_rig, {"params": typo}, "params:=.*typo.yaml: no such file"),
-        (simulated, {"params": typo}, "params:=.*typo.yaml: no such file"),
         (alongside_rig, {"calibration": bag}, "calibration:=.*: a folder, not a file"),
         (alongside_rig, {"registration": typo}, "registration:=.*typo.yaml: no such file"),
         (alongside_rig, {"bag": bag}, "already contains a bag"),
-        (simulated, {"bag": bag}, "already contains a bag"),
         (simulated, {"seed": "-1"}, "--seed = -1"),
         # A driver without configuration would run on its defaults.
-        (
-            alongside_rig,
-            {"drives": emulator},
-            "'drive_emulator' is not started here, only device_d",
-        ),
+        (alongside_rig, {"drives": emulator}, "'drive_emulator' is not started here, only device"),
         (simulated, {"params": operator}, "'simulated_operator' is not started here, only sim_rig"),
         (
             simulated,
@@ -99,9 +92,7 @@ def test_a_simulation_has_the_nodes_of_its_level_and_waits_for_a_recorder_only_i
     assert set(simulated(level="tip")) == {"sim_rig", "plane_controller"}
     alone = simulated(level="drive", simulated_operator="true")
     assert "wait_for_recorder" not in alone["simulated_operator"]
-    whole = simulated(
-        level="drive", simulated_operator="true", bag=str(tmp_path / "bag"), can="/tmp/c"
-    )
+    whole = simulated(level="drive", simulated_operator="true", bag=str(tmp_path / "bag"))
     assert whole["simulated_operator"]["wait_for_recorder"]
     assert whole["device_driver"]["channel"] == whole["drive_emulator"]["pty"] == "/tmp/c"
 
@@ -111,9 +102,8 @@ def test_a_file_of_two_rigs_has_both_namespaces(tmp_path: Path) -> None:
     file = tmp_path / "two.yaml"
     file.write_text(yaml.safe_dump(depths))
     for start in (alongside_rig, simulated):
-        for namespace in ("rig2", "/rig2/"):
-            given = start(params=str(file), namespace=namespace)
-            assert given["plane_controller"]["depth"] == 0.02
+        given = start(params=str(file), namespace="rig2")
+        assert given["plane_controller"]["depth"] == 0.02
         with pytest.raises(UserError, match="is for /rig1/plane_controller, this node is /plane_"):
             start(params=str(file))
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
-import shutil
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -80,12 +78,10 @@ def test_every_executable_is_a_known_node_of_parameter_files() -> None:
 def test_a_process_that_ignores_signals_is_killed_and_named(tmp_path: Path) -> None:
     orderly, slow, stubborn = (Played(name, log=tmp_path / name) for name in ("a", "b", "c"))
     slow.heeds, stubborn.heeds = {TERM, KILL}, {KILL}
-    assert stop([orderly, slow, stubborn], grace=0.0) == [
-        "c did not end on SIGINT and SIGTERM, killed"
-    ]
-    assert [number for name, number in Played.sent if name == "a"] == [INT, KILL]
+    (line,) = stop([orderly, slow, stubborn], grace=0.0)
+    assert line == "c did not end on SIGINT and SIGTERM, killed"
     assert [number for name, number in Played.sent if name == "b"] == [INT, TERM, KILL]
-    assert stubborn.exit_code == -KILL
+    assert (orderly.exit_code, slow.exit_code, stubborn.exit_code) == (0, 0, -KILL)
 
 
 def test_the_end_of_a_node_is_described_with_its_last_line(tmp_path: Path) -> None:
@@ -123,27 +119,15 @@ def test_a_graph_ends_in_order_and_warns_of_recording_errors(
     assert capsys.readouterr().err == "warning: the disk is full\n"
 
 
-@dataclasses.dataclass
-class Graph:
-    """Run of `simulate --graph` at level drive."""
-
-    bag: Path
-
-    def run(self) -> int:
-        with mock.patch.dict(os.environ):
-            argv = ["--level", "drive", "--graph", "--bag", str(self.bag)]
-            return simulate.simulate(parse(argv))
+def run_graph(bag: Path) -> int:
+    """Run `simulate --graph` at level drive."""
+    with mock.patch.dict(os.environ), mock.patch.object(simulate, "_report", lambda *_: 0):
+        return simulate.simulate(parse(["--level", "drive", "--graph", "--bag", str(bag)]))
 
 
-@pytest.fixture
-def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Graph:
-    monkeypatch.setattr(simulate, "_report", lambda *_: 0)
-    return Graph(tmp_path / "bag")
-
-
-def test_a_graph_runs_until_its_operator_ends(graph: Graph) -> None:
+def test_a_graph_runs_until_its_operator_ends(tmp_path: Path) -> None:
     Played.ended["simulated_operator"] = 1
-    assert graph.run() == 0
+    assert run_graph(tmp_path / "bag") == 0
     assert tuple(Played.all) == DRIVE_NODES
     assert {node.environment["ROS_DOMAIN_ID"] for node in Played.all.values()} != {""}
     operator = Played.all["simulated_operator"]
@@ -152,25 +136,23 @@ def test_a_graph_runs_until_its_operator_ends(graph: Graph) -> None:
     assert all(node.exit_code is not None for node in Played.all.values())
 
 
-def test_bad_input_leaves_nothing_and_a_failure_leaves_its_logs(graph: Graph) -> None:
-    for ended, left in (
-        ({"device_driver": 2}, False),
-        ({"device_driver": 3}, True),
-        ({"simulated_operator": 2}, True),
+def test_bad_input_leaves_nothing_and_a_failure_leaves_its_logs(tmp_path: Path) -> None:
+    for name, code, is_left in (
+        ("device_driver", 2, False),
+        ("device_driver", 3, True),
+        ("simulated_operator", 2, True),
     ):
+        bag = tmp_path / f"{name}_{code}"
         Played.ended.clear()
-        Played.ended.update(ended)
-        (name,) = ended
+        Played.ended[name] = code
         with pytest.raises(UserError, match=f"{name} ended with exit code"):
-            graph.run()
-        assert graph.bag.exists() is left
-        if left:
-            assert (graph.bag / "parameters.yaml").is_file()
-            shutil.rmtree(graph.bag)
+            run_graph(bag)
+        assert bag.exists() is is_left
+        assert (bag / "parameters.yaml").is_file() is is_left
 
 
 def test_an_interrupt_while_nodes_start_ends_them(
-    graph: Graph, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started: Callable[..., NodeProcess] = NodeGraph.start
 
@@ -181,10 +163,10 @@ def test_an_interrupt_while_nodes_start_ends_them(
 
     monkeypatch.setattr(NodeGraph, "start", start)
     with pytest.raises(KeyboardInterrupt):
-        graph.run()
+        run_graph(tmp_path / "bag")
     assert tuple(Played.all) == DRIVE_NODES[:4]
     assert all(node.exit_code is not None for node in Played.all.values())
-    assert not graph.bag.exists()
+    assert not (tmp_path / "bag").exists()
 
 
 def test_the_console_graph_has_page_and_live_view(

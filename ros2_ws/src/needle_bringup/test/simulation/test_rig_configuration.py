@@ -23,13 +23,12 @@ from needle_bringup.simulation.rig_configuration import (
     needle_parameters,
     nodes_of,
     refuse_reserved,
-    write_parameters,
 )
 from needle_bringup.simulation.simulate_options import SimulateOptions, parse
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.errors import UserError
 from needle_core.settings import parameter_files
-from needle_core.settings.parameter_files import Parameters, read_parameters
+from needle_core.settings.parameter_files import Parameters
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.sim_rig_parameters import SimRigParameters
@@ -77,20 +76,19 @@ def test_only_the_nodes_of_the_level_run() -> None:
     drive = camera | {"drive_emulator", "device_driver"}
     for level, nodes in (("tip", everywhere), ("camera", camera), ("drive", drive)):
         assert set(nodes_of(SimulateOptions(level=level))) == nodes
+    assert set(PACKAGES) <= set(parameter_files.NODES)
+
+
+def test_the_driver_finds_its_drives_in_a_graph() -> None:
     found = nodes_for("--level drive --graph")
     assert found["device_driver"]["channel"] == found["drive_emulator"]["pty"]
     assert found["simulated_operator"]["wait_for_recorder"]
-    mixed = nodes_for("--level drive --graph --drives galil,cia402")
-    assert mixed["drive_emulator"]["drives"] == "galil,cia402"
-    port = mixed["drive_emulator"]["listen"]
-    expected = {"insertion": "galil", "rotation": "cia402"}
-    assert {axis: mixed["device_driver"][f"{axis}_drive"] for axis in expected} == expected
-    assert mixed["device_driver"]["galil_address"] == f"127.0.0.1:{port}"
-    two = nodes_for("--level drive --graph --drives galil,zaber")
-    assert two["device_driver"]["zaber_address"] == f"127.0.0.1:{port + 1}"
     # Processes that share the cores wait for each other longer.
     assert found["device_driver"]["watchdog"] > 0.1
-    assert set(PACKAGES) <= set(parameter_files.NODES)
+    two = nodes_for("--level drive --graph --drives galil,zaber")
+    driver, port = two["device_driver"], two["drive_emulator"]["listen"]
+    assert (driver["insertion_drive"], driver["galil_address"]) == ("galil", f"127.0.0.1:{port}")
+    assert (driver["rotation_drive"], driver["zaber_address"]) == ("zaber", f"127.0.0.1:{port + 1}")
 
 
 def test_the_controller_is_configured_for_the_sensor_of_its_level() -> None:
@@ -102,28 +100,10 @@ def test_the_controller_is_configured_for_the_sensor_of_its_level() -> None:
     assert "tip_noise" not in nodes_for()["plane_controller"]
 
 
-def test_the_launched_rig_is_that_of_simulate() -> None:
-    # Beyond the defaults, simulate sets only what the command line gives, recording, and the
-    # emulated adapter: none of these describe the rig.
-    of_run = {"level", "seed", "preset"}
-    of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
-    set_by_simulate = {
-        node: set(values) - of_run for node, values in nodes_for("--level drive").items()
-    }
-    assert set_by_simulate["sim_rig"] == of_needle
-    assert set_by_simulate["plane_controller"] == {"depth", "target_offset"}
-    assert set_by_simulate["stereo_tracker"] == set()
-    assert SteeringSettings().tip_covariance == "from_tip_pose"
-    assert parse([]).depth_mm == pytest.approx(SteeringSettings().depth * 1e3)
-
-
-def test_later_layers_replace_single_parameters_and_files_round_trip(tmp_path: Path) -> None:
+def test_later_layers_replace_single_parameters() -> None:
     layers: list[Parameters] = [{"sim_rig": {"level": "tip", "seed": 2}}, {"sim_rig": {"seed": 3}}]
     merged = merge(*layers, {"console": {}})
     assert merged == {"sim_rig": {"level": "tip", "seed": 3}, "console": {}}
-    parameters = {"sim_rig": {"level": "tip", "curvature": 1e-5, "flag": True}}
-    write_parameters(tmp_path / "p.yaml", parameters)
-    assert read_parameters(tmp_path / "p.yaml", NODES) == parameters
 
 
 def test_a_file_must_not_conflict_with_the_command_line() -> None:
@@ -148,6 +128,7 @@ def test_the_defaults_of_a_needle_are_those_of_the_nodes() -> None:
             else:
                 assert default == shared.default
     assert SimRigParameters().pre_bend == pytest.approx(PRE_BEND)
+    assert SimulateOptions().depth_mm == pytest.approx(SteeringSettings().depth * 1e3)
     assert contradictions({}, NODES) == []
 
 

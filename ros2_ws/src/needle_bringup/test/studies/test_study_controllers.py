@@ -12,16 +12,13 @@ from needle_bringup.studies import study_controllers
 from needle_bringup.studies.study_controllers import (
     SteeredNeedles,
     controller_factory,
-    needles_at_a_time,
-    point_controller_factory,
 )
 from needle_bringup.studies.study_estimators import BestEstimators, SeparateEstimators
-from needle_bringup.studies.study_laws import each_rate, planned_law
+from needle_bringup.studies.study_laws import each_rate
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.arrays import Array
-from needle_controller.model.target_motion import TargetMotion
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import SteeringSettings
 
@@ -121,13 +118,10 @@ def test_the_belief_follows_from_the_estimates() -> None:
         # d sin(pitch) = cos(pitch) d pitch, to first order
         to_first_order = np.cos(pitch) * np.sqrt(covariance[4, 4])
         assert belief.sin_pitch_std[n] == pytest.approx(to_first_order, rel=0.02)
-    assert belief.missed is not None
-    assert np.all((belief.missed > 0.0) & (belief.missed < 0.5))
     # The paper's observer uses no covariance.
     paper = controller_factory("paper", 0.001)()
     paper.start(TIPS)
     assert paper.belief() is None
-    assert needles_at_a_time("paper") > needles_at_a_time("best")
 
 
 def test_needles_off_their_target_report_a_miss() -> None:
@@ -137,26 +131,7 @@ def test_needles_off_their_target_report_a_miss() -> None:
         each_rate(lambda _: still),
     )
     needles.start(tips)
-    # The point counts, not the plane x = 0.
-    to_points = point_controller_factory("best", 0.001)()
-    to_points.set_targets(0.0, tips[::-1] + np.array([[0.0, 0.0009, 0.0], [0.0, 0.0, 0.06]]))
-    to_points.start(tips[::-1])
-    for belief in (needles.belief(), to_points.belief()):
-        assert belief is not None
-        assert belief.missed is not None
-        assert belief.missed[0] < 0.8 < 0.95 < belief.missed[1]
-
-
-def test_a_planned_path_is_followed_and_without_one_the_needle_stops() -> None:
-    motion = TargetMotion()
-    needle, settings = (
-        HypothesisFilter(FilterSettings()),
-        SteeringSettings(depth=0.2, entry_angle_std=math.radians(2.0)),
-    )
-    needle.reset(np.zeros(3), np.zeros(2))
-    for target, has_a_way in (([0.004, 0.0, 0.08], True), ([0.05, 0.0, 0.02], False)):
-        motion.observe(motion.last_time + 1.0 if target[0] > 0.01 else 0.0, np.array(target))
-        command = planned_law(motion, settings)(needle.estimate(), 0.0, 0.0, math.inf)
-        assert command.insertion_left is not None
-        assert (command.insertion_left > 0.079) is has_a_way
-        assert (command.insertion_left == -math.inf) is not has_a_way
+    belief = needles.belief()
+    assert belief is not None
+    assert belief.missed is not None
+    assert belief.missed[0] < 0.8 < 0.95 < belief.missed[1]

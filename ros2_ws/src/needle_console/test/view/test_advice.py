@@ -14,9 +14,8 @@ ENABLED = DeviceStatus(state="HOLDING", homed=True)
 STEERING = ControllerStatus(state="STEERING")
 
 
-STEPS = [
+ADVICE = (
     (Snapshot(), None),
-    (Snapshot(DISABLED), None),
     (Snapshot(DISABLED, insertion=0.0), Button.CONFIRM),
     (
         Snapshot(DeviceStatus(state="DISABLED", needle_out_confirmed=True), insertion=0.0),
@@ -34,11 +33,11 @@ STEPS = [
     (Snapshot(DeviceStatus(state="HOLDING"), insertion=0.03), Button.RETRACT),
     (Snapshot(DeviceStatus(state="FAULT", fault="following_error")), Button.RESET),
     (Snapshot(DeviceStatus(state="ESTOPPED")), Button.RESET),
-]
+)
 
 
 def test_advised_buttons_of_a_run() -> None:
-    for snapshot, button in STEPS:
+    for snapshot, button in ADVICE:
         assert advise(snapshot, "console").button is button, snapshot
 
 
