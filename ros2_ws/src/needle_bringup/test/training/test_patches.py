@@ -9,10 +9,12 @@ from needle_bringup.training.needle_ends import (
     Pose,
     draw_needle,
     draw_shadow,
+    drawn_tracks,
+    shifted_tracks,
     true_map,
 )
 from needle_bringup.training.patches import patch
-from needle_bringup.training.samples import CANVAS
+from needle_bringup.training.samples import CANVAS, moved
 
 SIZE = 96
 
@@ -45,6 +47,41 @@ def test_a_needle_slides_along_its_own_curve() -> None:
     assert np.maximum(shorter - whole, 0.0).sum() < 0.03 * shorter.sum()
     back = pose.slid(-20.0).slid(20.0)
     assert np.hypot(back.x - pose.x, back.y - pose.y) < 0.5
+
+
+def test_tracks_without_a_background_are_faint() -> None:
+    pose = Pose(88.0, 88.0, 0.0, 0.0, 0.0, 2.5)
+    strongest = {True: 0.0, False: 0.0}
+    for seed in range(12):
+        for faint in (True, False):
+            factor = drawn_tracks(np.random.default_rng(seed), pose, CANVAS, faint=faint)
+            assert factor.min() > 0.0
+            strongest[faint] = max(strongest[faint], float(np.abs(factor - 1.0).max()))
+    # Up to three may overlap.
+    assert strongest[True] < 1.15**3 - 1.0
+    assert strongest[False] > 0.5
+
+
+def test_gel_moves_tracks_by_three_pixels_at_most() -> None:
+    spot = np.ones((CANVAS, CANVAS), np.float32)
+    spot[80:90, 80:90] = 0.2
+    weight = 1.0 - spot
+    for seed in range(10):
+        before = 1.0 - shifted_tracks(np.random.default_rng(seed), spot)
+        rows, columns = np.indices(spot.shape)
+        offset = [
+            (before * axis).sum() / before.sum() - (weight * axis).sum() / weight.sum()
+            for axis in (rows, columns)
+        ]
+        assert np.hypot(*offset) < 3.2
+
+
+def test_an_image_is_shifted_by_the_distance() -> None:
+    image = np.zeros((40, 40), np.float32)
+    image[20, 20] = 100.0
+    there = moved(image, 3.0, 0.0)
+    assert there[20, 23] == pytest.approx(100.0)
+    assert there[20, 20] == 0.0
 
 
 def test_patches_repeat_by_their_seed() -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from needle_bringup.training import traced_scenes
 from needle_bringup.training.samples import CANVAS, SIZE
 from needle_bringup.training.traced_patches import Cut, traced_patch
-from needle_bringup.training.traced_scenes import TracedScene, shaft_share
+from needle_bringup.training.traced_scenes import TracedScene, shaft_share, trace_scene
 from needle_core.files.installed import find_shared_file
 from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import load_stereo_rig
@@ -39,9 +43,10 @@ def test_points_are_cut_with_the_image(scale: float, angle: float) -> None:
     np.testing.assert_allclose(cut.point(np.array([199.0, 149.0])), centre, atol=0.1)
 
 
-def test_a_patch_at_the_border_is_whole() -> None:
+@pytest.mark.parametrize("place", [(3.0, 5.0), (398.0, 297.0), (200.0, 2.0)])
+def test_a_patch_at_the_border_is_whole(place: tuple[float, float]) -> None:
     image = np.full((300, 400), 77, np.uint8)
-    assert (Cut(np.array([398.0, 297.0]), 0.4, 0.7).image(image) == 77).all()
+    assert (Cut(np.array(place), 0.4, 0.7).image(image) == 77).all()
 
 
 @pytest.mark.parametrize("width_px", [4.0, 10.0])
@@ -67,6 +72,20 @@ def test_a_sample_and_its_labels_are_rotated_and_scaled_together(width_px: float
     assert ends > 5
 
 
+def test_half_of_the_samples_have_a_background_of_the_same_camera() -> None:
+    scene = bars(4.0)
+    samples = [traced_patch(np.random.default_rng(seed), [scene]) for seed in range(60)]
+    known = [sample for sample in samples if sample.background is not None]
+    assert 20 < len(known) < 50
+    # Where there is more needle than before, the image has changed.
+    differences = [
+        np.abs(sample.image.astype(float) - sample.background)[sample.share > 250].mean()
+        for sample in known
+        if sample.background is not None and (sample.share > 250).sum() > 60
+    ]
+    assert np.median(differences) > 20.0
+
+
 def test_the_width_of_a_shaft_is_that_of_its_outline() -> None:
     line = np.linspace([0.0, 0.0, 0.001], [0.003, -0.004, 0.06], 200)
     ahead = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
@@ -84,3 +103,29 @@ def test_the_width_of_a_shaft_is_that_of_its_outline() -> None:
         length = np.linalg.norm(np.diff(project(line, camera), axis=0), axis=1).sum()
         assert share.sum(dtype=float) / 255.0 == pytest.approx(width * length, rel=0.05)
         np.testing.assert_allclose(end, last)
+
+
+def test_a_scene_is_the_empty_phantom_then_a_needle_in_both_cameras(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    images = [
+        np.zeros((camera.image_height, camera.image_width), np.uint8)
+        for camera in (RIG.left, RIG.right)
+    ]
+    line = np.linspace([0.0, 0.0, -0.01], [0.003, -0.004, 0.06], 200)
+    meshes = [SimpleNamespace(line=line)] * 2
+    asked: dict[str, Any] = {}
+
+    def trace(*_: object, **words: Any) -> list[SimpleNamespace]:
+        asked.update(words)
+        pairs = (None, meshes, meshes)
+        return [SimpleNamespace(images=images, meshes=pair) for pair in pairs]
+
+    monkeypatch.setattr(traced_scenes, "trace_insertion", trace)
+    scene = trace_scene(SimpleNamespace(), RIG, 3)  # type: ignore[arg-type]
+    assert asked["depth"] == pytest.approx(asked["begin"] + asked["step"] * (asked["frames"] - 1))
+    assert not scene.shares[:2].any()
+    assert np.isnan(scene.ends[:2]).all()
+    assert scene.shares[2:].any(axis=(1, 2)).all()
+    # In the empty phantom, the later place of the needle is as wide as in the first pair.
+    np.testing.assert_array_equal(scene.widths_px[:2], scene.widths_px[2:4])
