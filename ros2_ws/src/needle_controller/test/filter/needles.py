@@ -53,12 +53,18 @@ def turns_for(count: int, seed: int = 5, size: float = 0.3) -> Array:
 
 
 def drive(
-    estimator: HypothesisFilter, turns: Array, tips: Array, covariance: Array | None = None
+    estimator: HypothesisFilter,
+    turns: Array,
+    tips: Array,
+    covariance: Array | None = None,
+    *,
+    age: float = 0.0,
+    step: float = STEP,
 ) -> Estimate:
     estimator.reset(tips[0], np.zeros(2))
     for turn, tip in zip(turns, tips[1:], strict=True):
-        estimator.advance(STEP, turn)
-        estimator.correct(tip, covariance)
+        estimator.advance(step, turn)
+        estimator.correct(tip, covariance, age)
     return estimator.estimate()
 
 
