@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from exact_needle import moved
 from needle_controller.filter.filter_settings import RollHypothesis, TorsionHypothesis
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.model.arrays import Array
@@ -40,9 +40,7 @@ def path(
             base += turn / parts
             behind = min(max(behind, base - play), base + play)
             tip = tip + (behind - tip) * (1 - np.exp(-STEP / parts / lag)) if lag else behind
-        x, z = curvature * STEP, tip - before
-        twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, STEP], [0, 0, 0, 0.0]])
-        pose = pose @ expm(twist)
+        pose = moved(pose, STEP, tip - before, curvature)
         poses.append(pose)
     return np.array(poses)
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+import exact_needle
 from needle_controller.filter.filter_settings import GAIN, LAG, PLAY, FilterSettings
 from needle_controller.filter.motion import LARGEST_TURN, advance_hypothesis, rotate
 from needle_controller.filter.records import E_KAPPA, E_SCALE, E_TORSION, ERROR, HYPOTHESIS
@@ -45,10 +45,8 @@ def test_the_step_is_the_exponential_of_the_twist(length: float, turn: float) ->
     after = moved(before, length, turn)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = before["rotation"], before["position"]
-    gone = before["scale"] * length
-    x, z = before["curvature"] * gone, before["gain"] * turn
-    twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, gone], [0, 0, 0, 0.0]])
-    wanted = pose @ expm(twist)
+    gone, tip_turn = before["scale"] * length, before["gain"] * turn
+    wanted = exact_needle.moved(pose, gone, tip_turn, before["curvature"])
     np.testing.assert_allclose(after["position"], wanted[:3, 3], atol=1e-12)
     np.testing.assert_allclose(after["rotation"], wanted[:3, :3], atol=1e-9)
 
