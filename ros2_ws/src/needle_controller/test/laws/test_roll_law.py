@@ -89,13 +89,11 @@ def test_small_errors_and_disagreeing_rolls_are_not_corrected() -> None:
     assert turned(weighed) == pytest.approx(-0.75 * 0.5)
 
 
-def torsion(
-    tip: float = 0.0, behind: float = 0.0, play: float = 0.0, lag: float = 0.0, gain: float = 1.0
-) -> Any:
-    t = np.zeros(1, TORSION)[0]
-    t["tip_angle"], t["behind_play"], t["play"], t["lag"] = tip, behind, play, lag
-    t["gain"] = gain
-    return t
+def torsion(tip: float = 0.0, behind: float = 0.0, **sizes: float) -> Any:
+    made = np.zeros(1, TORSION)[0]
+    for name, value in {"tip_angle": tip, "behind_play": behind, "gain": 1.0, **sizes}.items():
+        made[name] = value
+    return made
 
 
 def test_play_and_lag_are_compensated() -> None:

@@ -18,6 +18,7 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
     ("process_noise.*three numbers", {"process_noise": (1.0, 1.0)}),
     ("input_weight", {"preset": "paper", "input_weight": 0.0}),
     ("gain", {"preset": "paper", "process_noise": (0.0, 0.0, 0.0)}),
+    ("gain", {"preset": "paper", "state_weights": (0.0, 0.0, 0.0)}),
     ("unstable", {"preset": "paper", "step_length": 0.005}),
     ("target plane at 0.09 m", {"target_offset": 0.09}),
     ("flip 1 = 0.2 m is outside", {"flip_depths": (0.2,)}),
