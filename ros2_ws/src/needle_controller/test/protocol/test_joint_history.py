@@ -40,20 +40,17 @@ def test_joints_are_interpolated_and_unknown_outside_the_history() -> None:
 def test_samples_between_two_others_are_spaced() -> None:
     made = history(*((k * TICK, 1e-4 * k, 0.0) for k in range(12)))
     start, end = JointSample(TICK, 1e-4, 0.0), JointSample(10 * TICK, 1e-3, 0.0)
-    kept = made.between(start, end, 2.9e-4)
-    assert [sample.stamp_ns // TICK for sample in kept] == [4, 7]
-    assert [s.stamp_ns // TICK for s in made.between(start, end, 1e-5)] == list(range(2, 10))
+    for spacing, kept in ((2.9e-4, [4, 7]), (1e-5, list(range(2, 10)))):
+        found = made.between(start, end, spacing)
+        assert [sample.stamp_ns // TICK for sample in found] == kept
 
 
 def test_memory_is_bounded() -> None:
     made = JointHistory(length=10)
-    for i in range(1000):
-        made.add(JointSample(i, 1e-6 * i, 0.0))
-        assert made.oldest is not None
-        assert i - made.oldest.stamp_ns < 20
+    for number in range(1000):
+        made.add(JointSample(number, 1e-6 * number, 0.0))
     assert made.oldest is not None
-    assert made.oldest.stamp_ns <= 990
-    assert made.at(995) == JointSample(995, 1e-6 * 995, 0.0)
+    assert 980 < made.oldest.stamp_ns <= 990
 
 
 def test_consistent_samples_are_accepted() -> None:
@@ -83,9 +80,6 @@ def test_consistent_samples_are_accepted() -> None:
         assert made.add(sample) is result, row
         assert (made.latest == sample) is (result is SampleResult.ACCEPTED), row
         assert (made.rejected, bool(made.problem)) == (int(is_counted), is_counted), row
-        assert JointHistory().add(sample) is (
-            SampleResult.ACCEPTED if finite else SampleResult.REJECTED
-        ), row
 
 
 SPIKES = [(TICK, 0.0, 0.0), (TICK, 0.05, 3.0), (HOUR, 0.05, 0.0), (-HOUR, 0.05, 0.0)]
