@@ -87,8 +87,9 @@ def test_the_covariance_follows_the_steps_derivative(
 
 @pytest.mark.parametrize(("play", "lag"), [(0.1, 0.0), (0.0, 0.004), (0.0, 0.0)])
 def test_process_noise_is_added_where_it_belongs(play: float, lag: float) -> None:
-    drifts = {"curvature_drift": 3.0**0.5, "scale_drift": 2.0, "play_drift": 5.0**0.5}
-    settings = FilterSettings(curvature=1.0, lag_drift=1.0, **drifts)
+    drifts: dict[str, Any] = {"scale_drift": 2.0, "lag_drift": 1.0}
+    drifts |= {"curvature_drift": 3.0**0.5, "play_drift": 5.0**0.5}
+    settings = FilterSettings(curvature=1.0, **drifts)
     before = hypothesis(play, lag)
     before["covariance"] = 0.0
     before["covariance"][E_TORSION, E_TORSION] = 1e-30

@@ -58,15 +58,17 @@ def test_confidence_follows_from_covariance_and_miss_probability() -> None:
     interval = found.r1, found.low, found.high
     assert interval == pytest.approx((-0.002, -0.002 - half, -0.002 + half), rel=1e-4)
     wide = np.diag([1.1e-6, 0.0, 0.0, 0.0, 0.0, 0.0])
-    for changes, miss_probability, verdict in (
-        ({}, None, "trusted"),
-        ({}, 0.049, "trusted"),
-        ({}, 0.72, "doubtful: 72 % probability of a miss by 1 mm or more"),
-        ({"covariance": wide}, None, "doubtful: the uncertainty of x exceeds 1 mm"),
-        # An estimator without a probability gives no verdict.
-        ({"miss": None}, 0.72, ""),
+    uncertain = dataclasses.replace(estimate, covariance=wide)
+    # An estimator without a probability gives no verdict.
+    without = dataclasses.replace(estimate, miss=None)
+    for one, miss_probability, verdict in (
+        (estimate, None, "trusted"),
+        (estimate, 0.049, "trusted"),
+        (estimate, 0.72, "doubtful: 72 % probability of a miss by 1 mm or more"),
+        (uncertain, None, "doubtful: the uncertainty of x exceeds 1 mm"),
+        (without, 0.72, ""),
     ):
-        found = assess_confidence(dataclasses.replace(estimate, **changes), miss_probability)
+        found = assess_confidence(one, miss_probability)
         assert (found.verdict, found.is_doubtful) == (verdict, "doubtful" in verdict)
 
 

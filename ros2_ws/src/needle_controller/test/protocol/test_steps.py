@@ -96,7 +96,7 @@ def test_joints_that_were_sent_before_the_answer_do_not_show_a_standstill() -> N
 def test_the_command_does_not_depend_on_the_order_of_topics() -> None:
     """Answer, tips and joints of a step arrive in any order of the topics."""
     after = set()
-    for order in itertools.permutations(("answer", "tips", "joints", "joints")):
+    for order in set(itertools.permutations(("answer", "tips", "joints", "joints"))):
         rig = Rig()
         rig.steps(3)
         step = sent(rig.expose())
@@ -108,14 +108,16 @@ def test_the_command_does_not_depend_on_the_order_of_topics() -> None:
             joints.append(JointSample(rig.now, rig.insertion, rig.rotation))
             tips.append(rig.measured())
         actions: list[Action] = []
-        received = {"tips": iter([tips]), "joints": iter([joints[:3], joints[3:]])}
+        halves = iter((joints[:3], joints[3:]))
         for topic in order:
             if topic == "answer":
                 actions += rig.steering.on_result(step.stamp_ns, "succeeded")
-                continue
-            handle = rig.steering.on_tip if topic == "tips" else rig.steering.on_joints
-            for message in next(received[topic]):
-                actions += handle(message)
+            elif topic == "tips":
+                for tip in tips:
+                    actions += rig.steering.on_tip(tip)
+            else:
+                for sample in next(halves):
+                    actions += rig.steering.on_joints(sample)
         after.add(sent(actions))
     (command,) = after
     # The first tip of the needle at rest, not one exposed before or during the motion.
