@@ -18,7 +18,7 @@ from needle_controller.curvature.curvature_fit import (
 from needle_controller.curvature.insertion_arc import arc_points
 from needle_core.errors import UserError
 
-from .insertions import RADIUS, STEP, insertion_tips, uniform
+from .insertions import RADIUS, insertion_tips, uniform
 
 
 def test_arc_points_and_slopes() -> None:
@@ -106,14 +106,6 @@ def test_contradicted_priors_are_not_used_and_reported() -> None:
     assert [w.split(" was")[0] for w in checked.warnings] == ["the entry", "the heading"]
     good = fit_checked(uniform(exact[0], rng), insertion, CurvatureFitSettings())
     assert good.warnings == ()
-
-
-def test_a_straight_path_has_no_upper_bound() -> None:
-    rng = default_rng(7)
-    insertion = np.arange(0.0, 0.06, STEP)
-    tips = uniform(insertion[:, None] * np.array([0.0, 0.0, 1.0]), rng)
-    fit = fit_curvature(tips, insertion, CurvatureFitSettings(entry_std=math.inf))
-    assert math.isinf(float(fit.radius_interval()[1]))
 
 
 def test_bad_tips_are_refused() -> None:

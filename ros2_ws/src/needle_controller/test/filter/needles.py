@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from exact_needle import moved
-from needle_controller.filter.filter_settings import RollHypothesis, TorsionHypothesis
+from needle_controller.filter.filter_settings import TorsionHypothesis
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
@@ -16,7 +16,6 @@ from needle_controller.observers.estimator import Estimate
 CURVATURE = 1.0 / 0.122
 STEP = 0.001
 RIGID = (TorsionHypothesis(0.0, 0.0, 0.0, 1.0, heading_drift=0.03, roll_drift=0.03),)
-ROLL_AS_SET = (RollHypothesis(0.0, np.deg2rad(30.0), 1.0),)
 
 
 def path(

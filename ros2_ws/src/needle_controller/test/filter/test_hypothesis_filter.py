@@ -24,7 +24,6 @@ from needle_controller.model.kinematics import rotation_from_angles
 from .needles import (
     CURVATURE,
     RIGID,
-    ROLL_AS_SET,
     STEP,
     drive,
     noisy,
@@ -173,15 +172,6 @@ def test_covariance_is_honest_for_any_noise(lasting: float, sizes: npt.ArrayLike
         off = np.abs(filters.estimates["coordinates"][:, 0] - pose[0, 3])
         inside.append(off < 2.0 * spread)
     assert np.mean(inside[20:]) > 0.93
-
-
-def test_starts_as_the_base_is_turned() -> None:
-    estimator = HypothesisFilter(
-        FilterSettings(torsion_hypotheses=RIGID, roll_hypotheses=ROLL_AS_SET),
-        rotation_from_angles([0.1, 0.2, 0.0]),
-    )
-    estimator.reset(np.zeros(3), np.array([0.0, 0.7]))
-    np.testing.assert_allclose(estimator.estimate().coordinates[3:], [0.1, 0.2, 0.7], atol=1e-9)
 
 
 def test_a_start_without_a_tip_takes_the_next_one() -> None:

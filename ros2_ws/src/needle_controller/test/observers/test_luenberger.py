@@ -8,7 +8,7 @@ import pytest
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
-from needle_controller.laws.law import LinearizingLaw, OpenLoopLaw
+from needle_controller.laws.law import LinearizingLaw
 from needle_controller.many_needles import ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import virtual_input
@@ -106,13 +106,11 @@ def test_law_is_7_for_short_steps() -> None:
     assert float(command.virtual_input) == pytest.approx(-estimate.linearized @ gains.feedback)
 
 
-def test_law_limits_the_rotation_and_open_loop_never_turns() -> None:
-    one = observer()
-    slow = LinearizingLaw(law().gains._replace(max_rotation_per_length=10.0))
+def test_law_limits_the_rotation() -> None:
+    one, slow = observer(), law(max_rotation_per_length=10.0)
     for x, rate in ((0.02, -10.0), (-0.02, 10.0)):
         one.reset([x, 0.0, 0.0], [0.0, 0.0])
         assert slow(one.estimate()).rotation_rate == rate
-        assert OpenLoopLaw()(one.estimate()).rotation_rate == 0.0
 
 
 def test_many_needles_equal_single_ones() -> None:

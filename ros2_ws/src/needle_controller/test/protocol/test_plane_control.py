@@ -207,14 +207,6 @@ def test_a_moving_point_is_reached_if_its_clock_is_known() -> None:
     assert math.dist(ends[0], ends[1]) > 1e-5
 
 
-def test_steering_ends_at_the_depth_before_the_point() -> None:
-    needle = Needle(dataclasses.replace(TO_POINT, target_point=(0.0, 0.0, 0.04), depth=0.05))
-    needle.control.target_point = np.array([0.0, 0.0, 0.1])
-    needle.steer()
-    assert needle.tip[2] == pytest.approx(0.05, abs=0.0005)
-    assert not any(needle.reachable)
-
-
 def test_new_settings_keep_targets_and_obstacles_unless_they_change_them() -> None:
     control = PlaneControl(PLANE)
     control.plane = offset_plane(0.005)
