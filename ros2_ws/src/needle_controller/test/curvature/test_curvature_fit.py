@@ -85,17 +85,6 @@ def test_outliers_do_not_count() -> None:
     assert np.mean(fit.weights[~off] > 0.99) > 0.99
 
 
-def test_broadcasting_equals_looping() -> None:
-    rng = default_rng(5)
-    exact, insertion = insertion_tips(5, 0.05, rng)
-    tips = uniform(exact, rng)
-    whole = fit_curvature(tips, insertion)
-    for i in range(5):
-        one = fit_curvature(tips[i], insertion)
-        np.testing.assert_allclose(whole.curvature[i], one.curvature, rtol=1e-6)
-        np.testing.assert_allclose(whole.std[i], one.std, rtol=1e-5)
-
-
 def test_contradicted_priors_are_not_used_and_reported() -> None:
     rng = default_rng(6)
     exact, insertion = insertion_tips(1, 0.1, rng)

@@ -131,14 +131,6 @@ def test_after_a_jump_a_target_breathes_about_its_new_position() -> None:
     np.testing.assert_allclose(observed(path, 32.0).at(36.0), path(36.0), atol=1e-4)
 
 
-def test_many_targets_equal_single_ones() -> None:
-    paths: list[Path] = [sine(0.2), chest(0.3), lambda _: PLACE, drift]
-    both = observed(lambda t: np.stack([path(t) for path in paths]), 25.0)
-    times = np.array([26.0, 27.0, 28.0, 29.0])
-    alone = [observed(path, 25.0).at(time) for path, time in zip(paths, times, strict=True)]
-    np.testing.assert_allclose(both.at(times), alone, atol=1e-9)
-
-
 def test_a_fast_topic_takes_no_more_memory_than_a_slow_one() -> None:
     fast, slow = observed(sine(0.2), 25.0, every=0.01), observed(sine(0.2), 25.0)
     assert len(fast._times) <= 1.1 * len(slow._times)

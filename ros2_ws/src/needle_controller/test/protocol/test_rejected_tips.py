@@ -74,9 +74,10 @@ def test_queued_tips_with_too_late_stamps_are_removed() -> None:
     latest = rig.measured(ahead=10**9)
     for tip in (rig.measured(ahead=TICK), rig.measured(ahead=3 * TICK), latest):
         assert rig.steering.on_tip(tip) == []
+    assert "ahead of joint_states" in logged(rig.steering.on_tip(rig.measured(ahead=10**9 + 1)))
     # The topic keeps its order: two stamps were too late, the first was good.
     assert rig.steering.on_tip(rig.measured(ahead=2 * TICK)) == []
-    assert rig.steering.tips.rejected == {TipFault.AHEAD_OF_JOINTS: 2}
+    assert rig.steering.tips.rejected == {TipFault.AHEAD_OF_JOINTS: 3}
     rig.now += TICK
     assert sent(rig.joints()).stamp_ns == rig.now
 
