@@ -174,6 +174,20 @@ def test_a_wide_prior_removes_no_correlated_error() -> None:
     np.testing.assert_allclose(changes(before, after)[:, :3], 0.01, rtol=0.005)
 
 
+def test_the_noisier_coordinate_is_learnt() -> None:
+    noise = NoiseHypothesis(CORRELATED, (1.0, 2.0), (0.5, 0.5), 1.0, (0.0, 0.0))
+    settings = dataclasses.replace(PLAIN, noise_hypotheses=(noise,))
+    known, rng = estimates(np.eye(ERROR) * 1e-10, CORRELATED), np.random.default_rng(5)
+    weights = known["noise_weights"]
+    weights[:, :, :2] = 0.5
+    for _ in range(60):
+        off = rng.normal(size=3) * [2.0, 1.0, 0.3] * BOUND / np.sqrt(3.0)
+        # The estimates themselves stay.
+        weights[:] = taken(known, MIDDLE + off, settings=settings)["noise_weights"]
+    assert np.all(weights[:, 0, 1] > 0.9)
+    assert np.all(weights[:, 1:, 0] > 0.9)
+
+
 def test_an_exact_tip_is_used() -> None:
     after = taken(estimates(), MIDDLE, np.zeros((3, 3)))
     for name in HYPOTHESIS.names or ():
