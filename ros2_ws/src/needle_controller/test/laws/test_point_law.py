@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import integrate
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +17,7 @@ from needle_controller.laws.point_turns import (
     PointLawSettings,
     affordable_reserve,
     insertion_to_closest_point,
+    rest_after,
     write_lateral_offset,
 )
 from needle_controller.many_needles import ManyFilters
@@ -72,6 +74,19 @@ def test_an_unreachable_point_is_nearest_at_the_returned_length() -> None:
             np.array(target), write_lateral_offset(np.array(target), np.empty(2)), CURVATURE
         )
         assert found == pytest.approx(lengths[nearest, 0], abs=1e-4)
+
+
+def test_the_rest_of_a_need_follows_from_the_integral_of_the_bending() -> None:
+    left, length, need = 0.03, 0.007, np.array([0.002, -0.001])
+    for rate in (0.0, 1e-7, 200.0, -523.0):
+
+        def bent(along: float, axis: int, rate: float = rate) -> float:
+            angle = rate * along - 0.5 * np.pi
+            return CURVATURE * (left - along) * float((np.cos(angle), np.sin(angle))[axis])
+
+        expected = [need[k] - integrate.quad(bent, 0.0, length, (k,))[0] for k in range(2)]
+        rest = rest_after(need, left, CURVATURE, rate, length)
+        np.testing.assert_allclose(rest, expected, atol=1e-10)
 
 
 def test_the_bevel_takes_the_shorter_turn_towards_the_point() -> None:

@@ -13,6 +13,7 @@ from needle_controller.protocol.actions import (
     Action,
     Awaiting,
     PublishUpdate,
+    SendStep,
     SteeringState,
 )
 from needle_controller.protocol.confidence import Confidence
@@ -175,6 +176,18 @@ def test_an_uncertain_estimate_halves_the_speed(monkeypatch: pytest.MonkeyPatch)
         steering, "assess_confidence", lambda *_: Confidence("doubtful", is_doubtful=True)
     )
     assert sent(Rig().expose()).duration == pytest.approx(1.0)
+
+
+def test_a_recorded_step_replaces_the_sent_one() -> None:
+    rig = Rig()
+    rig.steering.on_recorded_step(5, JointSample(0, 0.0, 0.0))
+    assert rig.steering.on_result(5, "succeeded") == []
+    step = sent(rig.expose())
+    other = JointSample(0, step.insertion + 0.0004, step.rotation)
+    rig.steering.on_recorded_step(step.stamp_ns + 1, other)
+    assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
+    rig.run(SendStep(step.stamp_ns + 1, other.insertion, other.rotation, 0.5))
+    assert (rig.steering.step, rig.steering.tips.after_ns) == (1, rig.now)
 
 
 def test_a_failing_part_of_another_package_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
