@@ -183,7 +183,7 @@ def test_a_recorded_step_replaces_the_sent_one() -> None:
     rig.steering.on_recorded_step(5, JointSample(0, 0.0, 0.0))
     assert rig.steering.on_result(5, "succeeded") == []
     step = sent(rig.expose())
-    other = JointSample(0, step.insertion + 0.0004, step.rotation)
+    other = JointSample(0, step.insertion - 0.0004, step.rotation)
     rig.steering.on_recorded_step(step.stamp_ns + 1, other)
     assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
     rig.run(SendStep(step.stamp_ns + 1, other.insertion, other.rotation, 0.5))
