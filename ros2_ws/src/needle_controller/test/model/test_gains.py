@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 from scipy import integrate, linalg
 
 from needle_controller.model.arrays import Array
@@ -16,7 +15,6 @@ from needle_controller.model.gains import (
     held_input_response,
     sampled_observer_gain,
 )
-from needle_core.errors import UserError
 
 STD = 0.001 / np.sqrt(3.0)
 WEIGHTS: dict[str, Any] = {
@@ -74,15 +72,3 @@ def test_held_input_is_the_integral() -> None:
         return float(value)
 
     np.testing.assert_allclose(held_input_response(0.02), [column(i) for i in range(3)], rtol=1e-10)
-
-
-def test_weights_without_gains_are_rejected() -> None:
-    rows: list[tuple[dict[str, Any], str]] = [
-        ({"process_noise": (0.0, 0.0, 0.0)}, "process_noise"),
-        ({"state_weights": (0.0, 0.0, 0.0)}, "state_weights"),
-        ({"input_weight": 0.0}, "input_weight = 0"),
-        ({"step_length": 0.05}, "unstable"),
-    ]
-    for change, cause in rows:
-        with pytest.raises(UserError, match=cause):
-            gains(**change)

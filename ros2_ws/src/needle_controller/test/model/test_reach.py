@@ -19,7 +19,6 @@ from needle_controller.model.reachability import (
     reachability,
     widest_at,
 )
-from needle_controller.model.target_plane import point_from_message
 from needle_core.errors import UserError
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 
@@ -63,8 +62,7 @@ def test_the_largest_pitch_adds_a_straight_part() -> None:
 def test_reach_is_symmetric_and_broadcasts() -> None:
     reduced = default_rng(2).uniform(-1, 1, (50, 3)) * [0.02, 1.2, 3.0]
     whole = least_insertion(reduced, CURVATURE, tolerance=1e-3)
-    np.testing.assert_allclose(least_insertion(-reduced, CURVATURE, tolerance=1e-3), whole)
-    alone = [float(least_insertion(r, CURVATURE, tolerance=1e-3)) for r in reduced]
+    alone = [float(least_insertion(-r, CURVATURE, tolerance=1e-3)) for r in reduced]
     np.testing.assert_allclose(whole, alone, rtol=1e-14)
     assert np.all(whole <= least_insertion(reduced, CURVATURE) + 1e-12)
     assert np.isnan(least_insertion([np.nan, 0.0, 0.0], CURVATURE))
@@ -142,8 +140,3 @@ def test_rejections_of_a_point_give_the_reason_and_a_better_entry() -> None:
     check_point(aside - 1.001 * entry, CURVATURE, 0.15)
     with pytest.raises(UserError):
         check_point(aside - 0.999 * entry, CURVATURE, 0.15)
-    np.testing.assert_array_equal(point_from_message("rig", [1.0, 2.0, 3.0]), [1.0, 2.0, 3.0])
-    with pytest.raises(UserError, match="'world'"):
-        point_from_message("world", [0.0, 0.0, 0.1])
-    with pytest.raises(UserError, match="not finite"):
-        point_from_message("rig", [0.0, float("nan"), 0.1])

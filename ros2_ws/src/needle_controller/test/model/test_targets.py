@@ -63,14 +63,13 @@ def test_unreachable_planes_are_rejected() -> None:
         ("left_camera_optical", [0.0] * 3, unit, "left_camera_optical"),
         ("rig", [np.nan, 0.0, 0.0], unit, "not finite"),
         ("rig", [0.0] * 3, [0.0, 0.0, np.inf, 1.0], "not finite"),
-        ("rig", [0.0] * 3, [0.0] * 4, "length 0"),
         ("rig", [0.0] * 3, [0.0, 0.0, 0.0, 2.0], "length 2"),
         ("rig", [0.0] * 3, [0.0, half, 0.0, half], "90 deg"),
     ]
     for frame, position, quaternion, cause in rows:
         with pytest.raises(UserError, match=cause):
             plane_from_pose(frame, position, quaternion)
-    for offset, depth in ((0.05, 0.12), (-0.05, 0.12), (3.0, 0.12), (0.05, 0.15)):
+    for offset, depth in ((-0.05, 0.12), (3.0, 0.12), (0.05, 0.15)):
         with pytest.raises(UserError, match=r"cannot be reached.* takes .* m of insertion"):
             check_plane(offset_plane(offset), 1 / 0.122, depth)
     steep = plane_from_pose("rig", [0.0] * 3, [0.0, np.sin(0.6), 0.0, np.cos(0.6)])
@@ -130,14 +129,6 @@ def test_after_a_jump_a_target_breathes_about_its_new_position() -> None:
     path: Path = lambda t: calm(t) + (0.003 if t > 20.0 else 0.0)  # noqa: E731
     assert np.linalg.norm(observed(path, 20.5).last - path(20.5)) == 0.0
     np.testing.assert_allclose(observed(path, 32.0).at(36.0), path(36.0), atol=1e-4)
-
-
-def test_many_targets_equal_single_ones() -> None:
-    paths: list[Path] = [sine(0.2), chest(0.3), lambda _: PLACE, drift]
-    both = observed(lambda t: np.stack([path(t) for path in paths]), 25.0)
-    times = np.array([26.0, 27.0, 28.0, 29.0])
-    alone = [observed(path, 25.0).at(time) for path, time in zip(paths, times, strict=True)]
-    np.testing.assert_allclose(both.at(times), alone, atol=1e-9)
 
 
 def test_a_fast_topic_takes_no_more_memory_than_a_slow_one() -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,15 +23,13 @@ from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_core.errors import UserError
 
-ESTIMATOR = '''
+ESTIMATOR = """
 import numpy as np
 from needle_controller.model.arc_motion import arc
 from needle_controller.observers.estimator import pose_estimate
 
 
 class Own:
-    """Believes the last tip, and the model for the rest."""
-
     def __init__(self, settings, initial_rotation, entry, rng):
         self.settings, self.start, self.rng = settings, initial_rotation, rng
 
@@ -55,7 +52,7 @@ class Own:
     def change_frame(self, T_new_old):
         self.place = self.place @ T_new_old[:3, :3].T + T_new_old[:3, 3]
         self.turn = T_new_old[:3, :3] @ self.turn
-'''
+"""
 LAW = """
 import numpy as np
 
@@ -90,29 +87,21 @@ NUMBERS = itertools.count()
 
 
 @pytest.fixture
-def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Offer]:
+def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Offer:
     """Return a function that installs a package with a class `Own`, and returns its name."""
-    modules = []
 
-    def make(kind: str, source: str, package: str = "", name: str = "") -> str:
+    def make(kind: str, source: str, name: str = "") -> str:
         module = f"own_module_{next(NUMBERS)}"
-        folder = tmp_path / module
-        about = folder / f"{package or module}-1.0.dist-info"
+        about = tmp_path / module / f"{module}-1.0.dist-info"
         about.mkdir(parents=True)
-        (folder / f"{module}.py").write_text(source)
-        (about / "METADATA").write_text(
-            f"Metadata-Version: 2.1\nName: {package or module}\nVersion: 1.0\n"
-        )
-        (about / "entry_points.txt").write_text(
-            f"[{GROUPS[kind]}]\n{name or module} = {module}:Own\n"
-        )
-        monkeypatch.syspath_prepend(folder)
-        modules.append(module)
+        (about.parent / f"{module}.py").write_text(source)
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+        entry_point = f"[{GROUPS[kind]}]\n{name or module} = {module}:Own\n"
+        (about / "entry_points.txt").write_text(entry_point)
+        monkeypatch.syspath_prepend(about.parent)
         return name or module
 
-    yield make
-    for module in modules:
-        sys.modules.pop(module, None)
+    return make
 
 
 def test_an_own_estimator_replaces_the_presets(offer: Offer) -> None:
@@ -158,18 +147,14 @@ def test_an_own_estimator_may_use_a_measured_heading(offer: Offer) -> None:
 def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
     for sound, wrong, cause in (
         ("    def correct(self", "    def not_correct(self", "lacks correct(tip, covariance, age)"),
-        ("def change_frame(", "def not_change_frame(", "lacks change_frame(T_new_old)"),
         ("class Own", "class Other", "has no attribute 'Own'"),
         ("import numpy as np", "numpy", "loading it raised NameError"),
         ("= settings, initial", "= setting, initial", "raised NameError"),
         ("return pose_estimate(", "return (", "returned tuple, expected an Estimate"),
         ("(self.place, self.turn", "(self.place * np.nan, self.turn", "contains nan"),
         ("(self.place, self.turn", "(1e3 * self.place, self.turn", "expected m, in"),
-        ("(self.place, self.turn", "(0 * self.place, self.turn", "0.02 m off"),
         ("curvature, np.eye", "curvature * 0, np.eye", "curvature is 0 1/m, expected > 0"),
-        ("np.eye(6) * 1e-6)", "[[1, 2], [3]])", "estimate() raised ValueError"),
         ("reset(self, tip, joints)", "reset(self, tip)", "reset(tip, joints) raised TypeError"),
-        ("np.eye(6) * 1e-6)", "np.full((6, 6), np.inf))", "covariance contains inf"),
         ("np.where(np.isfinite(tip), tip, self.place)", "tip", "contains nan"),
         ("+ T_new_old[:3, 3]", "- T_new_old[:3, 3]", "change_frame by 0.002 m along x moves x by"),
         ("@ step.shift", "@ step.shif", "advance(d_insertion, d_rotation) raised AttributeError"),
@@ -190,9 +175,10 @@ def test_a_name_is_offered_by_one_package_and_is_a_class(offer: Offer) -> None:
         SteeringSettings(estimator="nobody")
     with pytest.raises(UserError, match=r"law = 'own_module_\d+': no installed package"):
         SteeringSettings(law=name)
-    for package in ("one", "two"):
-        offer("law", LAW, package=package, name="both")
-    with pytest.raises(UserError, match=r"several packages: (one|two) 1.0, (one|two) 1.0"):
+    for _ in range(2):
+        offer("law", LAW, name="both")
+    several = r"several packages: own_module_\d+ 1.0, own_module_\d+ 1.0"
+    with pytest.raises(UserError, match=several):
         SteeringSettings(law="both")
     function = offer("law", "def Own(estimate):\n    return 0.0\n")
     with pytest.raises(OwnPartError, match=r"is a function, expected a class .* \(settings\)"):
@@ -205,28 +191,18 @@ def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) ->
     estimate = pose_estimate(np.zeros(3), np.eye(3), 8.0, np.eye(6))
     assert float(law(estimate, 0.1).rotation_rate) == pytest.approx(4.0)
     assert float(law(estimate, 1.0).rotation_rate) == 10.0
-    for to_point in (
-        OwnLaw(checked_law(settings.law), settings).to_point,
-        prompt_point_law(settings),
-    ):
-        # A quarter of a circle of 50 mm radius, straight ahead, and behind.
-        for target, left in (
-            ((0.05, 0.0, 0.05), 0.05 * np.pi / 2.0),
-            ((0.0, 0.0, 0.1), 0.1),
-            ((0.0, 0.0, -0.02), -0.02),
-        ):
-            remaining = to_point(estimate, np.array(target)).insertion_left
-            assert remaining is not None
-            assert float(remaining) == pytest.approx(left)
+    own = OwnLaw(checked_law(settings.law), settings).to_point
+    # A quarter of a circle of 50 mm radius, and behind.
+    for target, left in (((0.05, 0.0, 0.05), 0.05 * np.pi / 2.0), ((0.0, 0.0, -0.02), -0.02)):
+        for to_point in (own, prompt_point_law(settings)):
+            assert to_point(estimate, target).insertion_left == pytest.approx(left)
 
 
 def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
     rate = "40.0 * insertion"
     for wrong, cause in (
-        ("np.nan", "contains nan"),
         ("np.zeros(3)", "has shape (3,), expected ()"),
         ("'fast'", "is of type str"),
-        ("estimate.speed", "to_plane(estimate, insertion) raised AttributeError"),
     ):
         with pytest.raises(OwnPartError) as error:
             checked_law(offer("law", LAW.replace(rate, wrong)))
@@ -243,15 +219,15 @@ def test_an_own_planner_steers_by_its_via_points(offer: Offer) -> None:
     settings = SteeringSettings(planner=offer("planner", PLANNER))
     way, target = PathSteering(settings), np.array([0.0, 0.0, 0.08])
     tip = entry_state(settings.curvature)
-    direct = way.route(tip, target, Obstacles(), 0.0)
-    assert direct is not None
-    assert direct.length is None
-    np.testing.assert_array_equal(direct.aim, target)
     sphere = Obstacle((0.0, 0.0, 0.04), (0.0, 0.0, 0.04), 0.003)
-    around = way.route(tip, target, Obstacles([sphere]), 0.0)
-    assert around is not None
-    np.testing.assert_allclose(around.aim, [0.0, -0.01, 0.04])
-    assert around.length == pytest.approx(2.0 * np.hypot(0.01, 0.04))
+    for obstacles, aim, length in (
+        (Obstacles(), target, None),
+        (Obstacles([sphere]), np.array([0.0, -0.01, 0.04]), 2.0 * np.hypot(0.01, 0.04)),
+    ):
+        route = way.route(tip, target, obstacles, 0.0)
+        assert route is not None
+        np.testing.assert_allclose(route.aim, aim)
+        assert route.length == pytest.approx(length)
     assert way.find_first(target, Obstacles([sphere]), 0.0) == ""
     none = way.find_first(target, Obstacles([sphere, sphere]), 0.0)
     assert none == f"planner {settings.planner} finds no path to the target point past 2 obstacles"

@@ -95,10 +95,22 @@ class Rig:
         start = self.insertion, self.rotation
         for share in (0.5 * part, part):
             self.now += TICK
-            self.insertion = start[0] + share * (step.insertion - start[0])
-            self.rotation = start[1] + share * (step.rotation - start[1])
+            self.go_to(start, step, share)
             self.joints()
         return self.steering.on_result(step.stamp_ns, text)
+
+    def go_to(self, start: tuple[float, float], step: SendStep, share: float) -> None:
+        """Move to a share of the way from joint positions to the end of a step."""
+        self.insertion = start[0] + share * (step.insertion - start[0])
+        self.rotation = start[1] + share * (step.rotation - start[1])
+
+    def withdraw(self) -> list[Action]:
+        """Move the needle out in steps of 0.5 mm."""
+        actions: list[Action] = []
+        while self.insertion > 0.0:
+            self.insertion = max(self.insertion - 0.0005, 0.0)
+            actions += self.settle(1)
+        return actions + self.settle()
 
     def steps(self, count: int) -> None:
         for _ in range(count):

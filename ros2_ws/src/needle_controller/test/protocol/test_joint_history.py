@@ -20,17 +20,18 @@ def history(*samples: tuple[int, float, float]) -> JointHistory:
 
 
 def test_joints_are_interpolated_and_unknown_outside_the_history() -> None:
-    empty = JointHistory()
-    assert (empty.at(5), empty.latest, empty.oldest) == (None, None, None)
+    assert JointHistory().at(5) is None
     first, last = JointSample(100, 1e-5, 0.0), JointSample(400, 2e-5, 0.0)
     three = history((100, 1e-5, 0.0), (200, 2e-5, -0.04), (400, 2e-5, 0.0))
-    assert (three.oldest, three.latest) == (first, last)
-    assert (three.at(100), three.at(400)) == (first, last)
-    assert three.at(125) == JointSample(125, 1.25e-5, -0.01)
-    assert three.at(300) == JointSample(300, 2e-5, -0.02)
-    assert (three.at(99), three.at(401)) == (None, None)
-    assert list(three.after(200)) == [last]
-    assert [sample.stamp_ns for sample in three.after(199)] == [200, 400]
+    for stamp_ns, wanted in (
+        (99, None),
+        (100, first),
+        (125, JointSample(125, 1.25e-5, -0.01)),
+        (300, JointSample(300, 2e-5, -0.02)),
+        (400, last),
+        (401, None),
+    ):
+        assert three.at(stamp_ns) == wanted
     # Stamps of a real clock keep their precision.
     begin = 1_700_000_000_000_000_001
     two = history((begin, 0.0, 0.0), (begin + 2, 2e-6, 0.0))
@@ -40,20 +41,17 @@ def test_joints_are_interpolated_and_unknown_outside_the_history() -> None:
 def test_samples_between_two_others_are_spaced() -> None:
     made = history(*((k * TICK, 1e-4 * k, 0.0) for k in range(12)))
     start, end = JointSample(TICK, 1e-4, 0.0), JointSample(10 * TICK, 1e-3, 0.0)
-    kept = made.between(start, end, 2.9e-4)
-    assert [sample.stamp_ns // TICK for sample in kept] == [4, 7]
-    assert [s.stamp_ns // TICK for s in made.between(start, end, 1e-5)] == list(range(2, 10))
+    for spacing, kept in ((2.9e-4, [4, 7]), (1e-5, list(range(2, 10)))):
+        found = made.between(start, end, spacing)
+        assert [sample.stamp_ns // TICK for sample in found] == kept
 
 
 def test_memory_is_bounded() -> None:
     made = JointHistory(length=10)
-    for i in range(1000):
-        made.add(JointSample(i, 1e-6 * i, 0.0))
-        assert made.oldest is not None
-        assert i - made.oldest.stamp_ns < 20
+    for number in range(1000):
+        made.add(JointSample(number, 1e-6 * number, 0.0))
     assert made.oldest is not None
-    assert made.oldest.stamp_ns <= 990
-    assert made.at(995) == JointSample(995, 1e-6 * 995, 0.0)
+    assert 980 < made.oldest.stamp_ns <= 990
 
 
 def test_consistent_samples_are_accepted() -> None:
@@ -83,9 +81,6 @@ def test_consistent_samples_are_accepted() -> None:
         assert made.add(sample) is result, row
         assert (made.latest == sample) is (result is SampleResult.ACCEPTED), row
         assert (made.rejected, bool(made.problem)) == (int(is_counted), is_counted), row
-        assert JointHistory().add(sample) is (
-            SampleResult.ACCEPTED if finite else SampleResult.REJECTED
-        ), row
 
 
 SPIKES = [(TICK, 0.0, 0.0), (TICK, 0.05, 3.0), (HOUR, 0.05, 0.0), (-HOUR, 0.05, 0.0)]

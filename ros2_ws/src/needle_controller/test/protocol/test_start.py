@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 
 from needle_controller.planning import entry
@@ -16,7 +17,6 @@ from needle_controller.protocol.steering import Steering
 from .rig import HOLD, MOVING, TICK, Rig, device, logged, none_sent, sent, state_of
 
 SETTINGS = SteeringSettings(target_offset=0.003, tip_covariance="configured")
-HOLDING = dataclasses.replace(HOLD, insertion_m=0.0, rotation_rad=0.0)
 
 
 def test_start_reports_the_missing_device_state() -> None:
@@ -37,32 +37,22 @@ def test_start_reports_the_missing_device_state() -> None:
         assert state_of(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
 
 
-def test_start_waits_until_joints_and_device_agree() -> None:
-    """The joints lag behind the device's status after homing."""
-    for insertion, rotation, agree in (
-        (4.9e-5, -1.9e-2, True),
-        (5.1e-5, 0.0, False),
-        (0.0, 2.1e-2, False),
-    ):
-        rig = Rig(started=False)
-        rig.steering.on_device(
-            dataclasses.replace(HOLDING, insertion_m=insertion, rotation_rad=rotation)
-        )
-        assert ("waiting for joint_states to agree" not in rig.start()) is agree
-    for incomplete in (
-        dataclasses.replace(HOLDING, insertion_m=None),
-        dataclasses.replace(HOLDING, rotation_rad=None),
-    ):
-        rig = Rig(started=False, insertion=0.001)
-        rig.steering.on_device(incomplete)
+@pytest.mark.parametrize(
+    ("insertion", "rotation", "agree"),
+    [(4.9e-5, -1.9e-2, True), (5.1e-5, 0.0, False), (0.0, 2.1e-2, False), (None, 0.0, True)],
+)
+def test_start_waits_until_joints_and_device_agree(
+    insertion: float | None, rotation: float, agree: bool
+) -> None:
+    """The joints lag behind the device's status after homing; a status without them agrees."""
+    rig = Rig(started=False)
+    status = dataclasses.replace(HOLD, insertion_m=insertion, rotation_rad=rotation)
+    rig.steering.on_device(status)
+    assert ("waiting for joint_states to agree" not in rig.start()) is agree
+    if not agree:
+        rig.insertion, rig.rotation = insertion or 0.0, rotation
+        rig.settle()
         assert rig.start() == "steering"
-    rig = Rig(started=False, insertion=0.0015)
-    rig.steering.on_device(HOLDING)
-    assert "waiting for joint_states" in rig.start()
-    rig.insertion = 0.0
-    rig.settle()
-    assert rig.start() == "steering"
-    sent(rig.expose())
 
 
 def test_start_is_refused_for_an_inserted_or_rolled_needle() -> None:
@@ -86,26 +76,21 @@ def test_start_and_stop_are_idempotent() -> None:
     assert rig.start() == "already steering"
     assert rig.steering.starts == 1
     rig.steps(5)
+    # A stop clears the queue of tips.
+    rig.steering.on_tip(rig.measured(ahead=TICK))
     for text in ("stopped", "was not steering (IDLE)"):
         reply, _ = rig.steering.on_stop()
         assert (reply.success, reply.message) == (True, text)
         assert state_of(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
     # Steering continues with the old estimate.
     assert rig.start() == "steering"
-    assert rig.steering.reason == ""
-    step = sent(rig.expose())
-    assert step.insertion == pytest.approx(0.006)
-    assert (rig.steering.step, rig.steering.starts) == (5, 2)
-    # A stop clears the queue of tips.
-    rig.run(step)
-    rig.steering.on_tip(rig.measured(ahead=TICK))
-    rig.steering.on_stop()
-    assert rig.start() == "steering"
     assert none_sent(rig.settle(1))
+    assert sent(rig.expose()).insertion == pytest.approx(0.006)
+    assert (rig.steering.step, rig.steering.starts) == (5, 2)
 
 
 def test_a_needle_that_is_out_restarts_the_estimate() -> None:
-    rig = Rig(insertion=0.0)
+    rig = Rig()
     rig.steps(2)
     rig.steering.on_stop()
     assert rig.start() == "steering"
@@ -117,24 +102,20 @@ def test_a_needle_that_is_out_restarts_the_estimate() -> None:
 def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.MonkeyPatch) -> None:
     # The search for another entry is tested with the planner.
     monkeypatch.setattr(entry, "nearest_entry", lambda *_: None)
-    buried = (0.0, 0.0, 0.06, 0.0, 0.0, 0.06, 0.004)
-    steering = Steering(
-        dataclasses.replace(SETTINGS, target_point=(0.0, 0.0, 0.06), obstacles=buried)
-    )
-    rig = Rig(started=False)
-    rig.steering = steering
-    steering.on_device(HOLD)
-    rig.joints()
+    rig, target = Rig(started=False), (0.0, 0.0, 0.06)
+    control = rig.steering.control
+    control.target_point = np.array(target)
+    control.obstacles = Obstacles([Obstacle(target, target, 0.004)])
     assert "the target point is" in rig.start()
     # A new obstacle stops the needle.
-    steering.control.obstacles = Obstacles([Obstacle((0.05, 0.0, 0.02), (0.05, 0.0, 0.02), 0.001)])
+    control.obstacles = Obstacles([Obstacle((0.05, 0.0, 0.02), (0.05, 0.0, 0.02), 0.001)])
     assert rig.start() == "steering"
     rig.steps(2)
     wall = [Obstacle((-0.06, y, 0.03), (0.06, y, 0.03), 0.02) for y in (-0.03, 0.0, 0.03)]
-    steering.control.obstacles = Obstacles(wall)
+    control.obstacles = Obstacles(wall)
     while not none_sent(actions := rig.expose()):
         rig.run(sent(actions))
     assert "IDLE: no path from insertion 0.0" in logged(actions)
     assert state_of(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-    problem = steering.control.path_problem(0.0)
+    problem = control.path_problem(0.0)
     assert "no path to the target point is clear of the 3 obstacles, nor from any entry" in problem
