@@ -104,13 +104,8 @@ def test_echo_receives_earlier_messages_and_shortens_arrays(ros2: Ros2) -> None:
     assert ros2("topic", "echo", "--once", "/rig/status", "--field", "frame_id").stdout == (
         "above\n---\n"
     )
-    of_another = ros2(
-        "topic", "echo", "/rig/status", "--filter", "not m.frame_id", "--timeout", "1"
-    )
-    assert of_another.stdout == ""
-    assert (
-        ros2("topic", "echo", "--once", "/rig/status", "--filter", "m.frame_id").stdout == expected
-    )
+    other = ros2("topic", "echo", "/rig/status", "--filter", "not m.frame_id", "--timeout", "1")
+    assert other.stdout == ""
     axes = ros2("topic", "echo", "--once", "/rig/axes").stdout
     assert axes.count("- 0.5\n") == 128
     assert "- '...'\n" in axes
@@ -155,27 +150,11 @@ def test_parameters_are_read_and_set(ros2: Ros2) -> None:
     assert ros2("param", "get", "/rig/partner", "speed").stdout == "Double value is: 0.25\n"
 
 
-def test_a_missing_answer_is_reported(domain: int, ros2: Ros2) -> None:
-    context = Context()
-    rclpy.init(context=context, domain_id=domain)
-    deaf = Node("deaf", context=context)  # never spun
-    deaf.create_service(SetBool, "deaf/enable", lambda _, response: response)
-    call = ros2("service", "call", "/deaf/enable", "std_srvs/srv/SetBool", "{data: true}")
-    get = ros2("param", "get", "/deaf", "speed")
-    assert (call.returncode, call.stderr) == (1, "no answer from /deaf/enable\n")
-    assert (get.returncode, get.stderr) == (1, "no answer from /deaf\n")
-    deaf.destroy_node()
-    rclpy.try_shutdown(context=context)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("topic", "pub", "/t", "sensor_msgs/msg/Joyy"), "no msg type"),
         (("topic", "pub", "/t", "sensor_msgs/msg/Joy", "{axes: [a]}"), "is not a sequence<float>"),
-        (("topic", "pub", "/t", "sensor_msgs/msg/Joy", "{axis: [1]}"), "no field 'axis'"),
-        (("topic", "pub", "/t", "std_msgs/msg/Bool", "{data: 1}"), "data: 1 is not a boolean"),
-        (("topic", "pub", "/t", "std_msgs/msg/Bool", "true"), "expected to be a dictionary"),
         (("topic", "pub", "/t", "std_msgs/msg/Bool", "{data: ["), "not YAML"),
         (("service", "call", "/s", "std_srvs/msg/SetBool"), "no srv type"),
         (("param", "get", "/nobody", "speed"), "Node not found"),

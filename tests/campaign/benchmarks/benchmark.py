@@ -38,7 +38,6 @@ exit codes: 0 done; 2 invalid input; 130 interrupted
 BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
     "studies": study_benchmark.studies,
     "updates": study_benchmark.updates,
-    "memory": study_benchmark.memory,
     "recording": recording_benchmark.writer_rows,
     "latency": latency_benchmark.rows,
     "link": link_benchmark.rows,

@@ -8,8 +8,12 @@ import select
 import signal
 import subprocess
 import sys
+import uuid
 
-from needle_core.process.ros_domain import FIRST_PARTICIPANT, ports_of, reserve_domain_id
+import pytest
+
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import FIRST_PARTICIPANT, Claim, ports_of, reserve_domain_id
 from needle_core.process.shared_memory import SHARED_MEMORY
 
 
@@ -115,3 +119,26 @@ def test_a_node_exits_after_a_stalled_subscriber_has_its_messages() -> None:
             subscriber.send_signal(signal.SIGCONT)
         assert publisher.wait(30.0) == 7
         assert subscriber.communicate(timeout=30.0)[0].split() == b"0 1 2 3 4 5 6 7 8 9".split()
+
+
+CLAIMS = """
+import sys
+from needle_core.process.ros_domain import Claim
+claim = Claim(sys.argv[1], "/first")
+print("has it", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_kill_releases_the_name_of_a_process() -> None:
+    name = f"/device/status {uuid.uuid4()}"
+    with subprocess.Popen(
+        [sys.executable, "-c", CLAIMS, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as first:
+        assert first.stdout is not None
+        assert first.stdout.readline() == b"has it\n"
+        with pytest.raises(UserError, match=rf"/first \(process {first.pid}\) has {name}"):
+            Claim(name, "/second")
+        first.kill()
+        first.wait()
+        Claim(name, "/second").release()
