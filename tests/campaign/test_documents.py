@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from campaign.typed_pages import PAGES, ROOT, PageError, Session, blocks
+from campaign.typed_pages import PAGES, ROOT, Session, blocks
 from needle_core.process.ros_domain import reserve_domain_id
 from needle_tracker.calibrating.calibration_session import parse_session
 
@@ -119,6 +119,7 @@ def test_every_block_works_as_written(
         }
         session = Session(checkout, environment, print, shortened(scratch, runs))
         session.type(checkout / page)
+    assert session.outputs
     if page == "docs/examples/README.md":
         (from_topics,) = (text for text in session.outputs if "above the plane" in text)
         (above,) = re.findall(r"done, (\S+) mm above the plane", from_topics)
@@ -132,54 +133,3 @@ def test_every_block_works_as_written(
         insertion, rotation = map(float, re.findall(r"-?\d[\d.e-]*", joints))
         assert insertion == pytest.approx(0.001, abs=1e-5)
         assert rotation == pytest.approx(0.1, abs=2e-3)
-
-
-def test_a_block_that_fails_is_named_by_page_and_line(checkout: Path, tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("Words.\n\n    true\n\nMore.\n\n    echo said; exit 3   # so it is\n")
-    session = Session(checkout, os.environ, print)
-    with pytest.raises(PageError, match=r"page\.md:7: .*\nends with 3: said"):
-        session.type(page)
-
-
-def test_blocks_of_every_kind_are_found_and_a_yaml_without_a_name_is_refused() -> None:
-    page = """\
-Words.
-
-    one
-    two \\
-        more
-
-<!-- not typed: a reason -->
-
-    three
-
-- item
-
-  ```sh
-  four
-  ```
-
-```text
-five
-```
-
-<!-- Ctrl-C -->
-
-```yaml a.yaml
-six: 1
-```
-
-```python
-print(1)
-```
-"""
-    found = [(b.line, b.kind, b.text, b.name, b.ends_nodes) for b in blocks(page)]
-    assert found == [
-        (3, "command", "one\ntwo \\\n    more", "", False),
-        (13, "command", "four", "", False),
-        (23, "file", "six: 1", "a.yaml", True),
-        (27, "python", "print(1)", "", False),
-    ]
-    with pytest.raises(PageError, match="line 1"):
-        blocks("```yaml\na: 1\n```\n")

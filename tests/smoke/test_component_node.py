@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -46,23 +42,10 @@ from needle_core.errors import UserError
 from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.ros import base_node
 from needle_core.ros.component_node import ComponentNode
-from needle_core.ros.main import run_component
 from needle_core.settings.parameter_fields import check_fields, parameter
 
 TIMEOUT = 60.0  # [s]
 LONGEST = 1000
-
-
-@contextmanager
-def own_context() -> Iterator[Context]:
-    """Yield a ROS context with a domain of its own."""
-    with reserve_domain_id() as domain:
-        context = Context()
-        rclpy.init(context=context, domain_id=domain)
-        try:
-            yield context
-        finally:
-            context.try_shutdown()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,21 +118,16 @@ class Echo(Component):
 
     def _on_batch(self, batch: Any, at: Moment) -> Actions:
         yield Send("wire", batch)
-        if batch == ("end",):
-            os.kill(os.getpid(), signal.SIGTERM)
 
 
 class Wire:
     """A port in memory, which delivers given items."""
 
-    def __init__(self, *first: Any) -> None:
+    def __init__(self) -> None:
         self.sent: list[Any] = []
-        self._first = first
 
     def open(self, arrive: Callable[[Any], None]) -> None:
         self.arrive = arrive
-        for batch in self._first:
-            arrive(batch)
 
     def send(self, batch: tuple[Any, ...]) -> None:
         self.sent.append(batch)
@@ -229,10 +207,13 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    with own_context() as context:
+    with reserve_domain_id() as domain:
+        context = Context()
+        rclpy.init(context=context, domain_id=domain)
         bench = Bench(context)
         yield bench
         bench.close()
+        context.try_shutdown()
 
 
 def test_bad_or_long_data_and_a_failing_handler_are_reported_and_end_nothing(bench: Bench) -> None:
@@ -299,25 +280,5 @@ def test_parameters_are_applied_together_typed_and_within_bounds_or_rejected(ben
     clock = Parameter("use_sim_time", value=True).to_parameter_msg()
     assert set_to(clock) == (False, "use_sim_time is fixed at start")
     assert bench.echo.settings == Settings(2.0)
-    for given, cause in (
-        ({"gian": 2.0}, "unknown parameter 'gian' (did you mean 'gain'?)"),
-        ({"use_sim_time": True}, "use_sim_time = true: this node runs in real time"),
-    ):
-        with pytest.raises(UserError) as caught:
-            bench.make(**given)
-        assert str(caught.value).startswith(f"/echo: {cause}")
-
-
-def test_a_node_ends_on_sigterm_as_its_component_wishes(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    wire = Wire(("end",))
-    with reserve_domain_id() as domain:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-        monkeypatch.setattr(sys, "argv", ["echo"])
-        code = run_component(
-            "echo", Settings, Echo, help_text="", ports=lambda _: {"wire": wire}, interrupted=130
-        )
-    assert code == 130
-    assert wire.sent == [("end",), "closed"]
-    assert "echo: asked to" in capsys.readouterr().err
+    with pytest.raises(UserError, match="/echo: use_sim_time = true: this node runs in real time"):
+        bench.make(use_sim_time=True)

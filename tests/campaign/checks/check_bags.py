@@ -1,22 +1,14 @@
-"""Step E: complete and readable bags, and clean exits of all nodes."""
+"""Step E: a complete and readable bag at full rate."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 
 from campaign.checking import Check, Finding, Workbench, at_most, bag_read_error
-from campaign.trials.recording_trials import record_and_kill, record_full_rate
-from campaign.trials.signal_trials import signal_trials
+from campaign.trials.recording_trials import record_full_rate
 
 DURATION = 60.0
-MOMENTS = 25
 PROCESSOR_SHARE, MEMORY_GROWTH_MB = 0.35, 5.0
-LAST_SECONDS = 0.5
-SIGNALS = 100
-# Longest time to exit [s]. The recorder first receives late messages for up to a second and
-# completes its bag; for other nodes, launchers send SIGTERM after 5 s.
-LONGEST_END, LONGEST_END_OF_OTHERS = {"recorder": 10.0}, 5.0
 
 
 def full_rate(bench: Workbench) -> Iterator[Finding]:
@@ -38,44 +30,4 @@ def full_rate(bench: Workbench) -> Iterator[Finding]:
     yield Finding("full_rate_readers", "rosbags and mcap", "read all", why or "read all", not why)
 
 
-def killed(bench: Workbench) -> Iterator[Finding]:
-    """Kill the recorder at random moments, with images and without, and recover the bag."""
-    for what, argv in (("images", ()), ("small", ("small",))):
-        folder = bench.folder / f"killed_{what}"
-        folder.mkdir()
-        whys, ages, gaps = zip(*record_and_kill(folder, MOMENTS, *argv), strict=True)
-        shutil.rmtree(folder)
-        why = [one for one in whys if one]
-        yield Finding(
-            f"killed_{what}",
-            f"kill -9 at {MOMENTS} random moments, {what}, then recover",
-            f"rosbags and mcap open all, at most the last {LAST_SECONDS:g} s missing, no gaps",
-            f"{len(why)} do not {why[:1]}, at most {max(ages):.2f} s missing, {sum(gaps)} gaps",
-            not why and max(ages) <= LAST_SECONDS and not sum(gaps),
-        )
-
-
-def signals(bench: Workbench) -> Iterator[Finding]:
-    """Send SIGINT, SIGINT twice, SIGTERM or SIGHUP to all nodes at random moments."""
-    for burners in (0, 2):
-        folder = bench.folder / f"signals_{burners}"
-        folder.mkdir()
-        found = list(signal_trials(folder, SIGNALS, burners))
-        shutil.rmtree(folder)
-        slowest: dict[str, float] = {}
-        for one in found:
-            slowest[one.node] = max(one.seconds, slowest.get(one.node, 0.0))
-        late = {n for n, s in slowest.items() if s > LONGEST_END.get(n, LONGEST_END_OF_OTHERS)}
-        wrong = [f"{one.node} after {one.when}: {one.wrong}" for one in found if one.wrong]
-        times = ", ".join(f"{node} {seconds:.2f} s" for node, seconds in sorted(slowest.items()))
-        yield Finding(
-            f"signals_{'busy' if burners else 'idle'}",
-            f"signals at random moments at 2 x 30 Hz beside {burners} others: {len(found)} ends",
-            f"exit code 0 or 130, no traceback, within {LONGEST_END_OF_OTHERS:g} s "
-            f"(recorder {LONGEST_END['recorder']:g} s, its bag whole)",
-            "; ".join([f"{len(wrong)} otherwise", f"slowest: {times}", *wrong[:3]]),
-            not wrong and not late,
-        )
-
-
-CHECKS: tuple[Check, ...] = (full_rate, killed, signals)
+CHECKS: tuple[Check, ...] = (full_rate,)

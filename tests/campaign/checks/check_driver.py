@@ -1,92 +1,18 @@
-"""Step D: the device driver on emulated drives, over many steps and with killed nodes."""
+"""Step D: an insertion on emulated drives, during which a node is killed."""
 
 from __future__ import annotations
 
-import math
-import os
 import random
 import tempfile
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
-from campaign.checking import Check, Finding, Workbench, at_most, in_own_process
-from needle_core.errors import UserError
-from needle_device_driver.axes.backend import HAND
-from needle_device_driver.conformance.faults import FAULTS, can_keep
-from needle_device_driver.conformance.rig import FASTEST, ConformanceRig
-from needle_device_driver.conformance.scenarios import random_moment
-from needle_device_driver.parameters import BACKENDS
-from needle_sim.drive_emulator import COUNTS_PER_RADIAN, DriveEmulatorParameters
+from campaign.checking import Check, Finding, Workbench, in_own_process
 from scenario.faults import Fault, Kind
 from scenario.process_run import PARTS, run_processes
 from scenario.rig_run import RunResult
 
-STEPS = 10_000
-MOMENTS, DRIVE_MOMENTS = 50, 200
-# Largest growth of memory of driver and drives in 9,000 steps [MB]: less than a byte per cycle.
-MEMORY_SLACK = 2.0
-_DEEPEST, _MOST_ROTATION, _STEP = 0.19, 3.0, 0.002
-_COUNTS = DriveEmulatorParameters().insertion_counts_per_unit, COUNTS_PER_RADIAN
-
-
-def many_steps(_: Workbench) -> Iterator[Finding]:
-    """Make random steps: exact to a count, all succeed, without growth of memory."""
-    off, outcomes, growth = in_own_process(random_steps, STEPS)
-    what = f"{STEPS:,} random steps: the motors' place against the sum of commands"
-    yield at_most("steps_position", what, 1.0, max(map(abs, off)), " counts")
-    failures = [outcome for outcome in outcomes if outcome != "succeeded"]
-    yield Finding(
-        "steps_results",
-        "results of these steps",
-        "one for each, all succeeded",
-        f"{len(outcomes)} results, {len(failures)} other {failures[:1]}",
-        len(outcomes) == STEPS and not failures,
-    )
-    what = "growth of memory, from a tenth of the steps on"
-    yield at_most("steps_memory", what, MEMORY_SLACK, growth, " MB")
-
-
-def random_steps(count: int) -> tuple[list[float], list[str], float]:
-    """Make random steps to the largest depth, retract, and repeat.
-
-    Returns
-    -------
-    list of float, list of str, float
-        Distance of the motors from the sum of all commands [counts], the results, and the growth of
-        memory of this process [MB].
-    """
-    rng, rig, memory = random.Random(1), ConformanceRig(1), [0.0]
-    rig.home()
-    rig.press()
-    at = list(rig.positions)
-    for number in range(count):
-        # Log-uniform from 0.01 mm.
-        length = math.exp(rng.uniform(math.log(1e-5), math.log(_STEP)))
-        turn = rng.uniform(-0.6, 0.6)
-        turn = -turn if abs(at[1] + turn) > _MOST_ROTATION else turn
-        if at[0] + length > _DEEPEST:
-            rig.call("device/retract")
-            rig.until(lambda: rig.hand.status.activity == "retraction", "a retraction")
-            rig.until(lambda: rig.hand.status.activity == "none", "its end")
-            rig.press()
-            # A retraction ends at the home switch, a few counts from 0.
-            at[0] = rig.positions[0]
-        at = [at[0] + length, at[1] + turn]
-        # Margin: rounding of the start to a count must not make the fastest step too fast.
-        duration = max(length / FASTEST, abs(turn) / 3.0) * rng.uniform(1.01, 1.5)
-        stamp = rig.command(at[0], at[1], duration)
-        rig.until(lambda stamp=stamp: stamp in rig.hand.results, "a result")  # type: ignore[misc]
-        if number in (count // 10, count - 1):
-            memory.append(_memory())
-    rig.runner.run(0.1)
-    off = [(a - b) * c for a, b, c in zip(rig.positions, at, _COUNTS, strict=True)]
-    return off, list(rig.hand.results.values()), (memory[-1] - memory[1]) / 1e6
-
-
-def _memory() -> float:
-    pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
-    return float(pages * os.sysconf("SC_PAGE_SIZE"))
+MOMENTS = 50
 
 
 def killed_nodes(_: Workbench) -> Iterator[Finding]:
@@ -109,27 +35,4 @@ def _kill(seed: int, node: str, at: float) -> RunResult:
         return run_processes(seed, Path(name), [Fault(node, Kind.OFF, at, 3.0, 0.0)])
 
 
-def faults_of_all_drives(_: Workbench) -> Iterator[Finding]:
-    """Cause faults at random moments with each kind of drive."""
-    for axis in sorted(BACKENDS.keys() - {HAND}):
-        missed = [text for seed in range(DRIVE_MOMENTS) if (text := _missed(axis, seed))]
-        yield Finding(
-            f"faults_{axis}",
-            f"faults at {DRIVE_MOMENTS} random moments, {axis} drives",
-            "each stops within its bound, names the cause, and causes no later motion",
-            f"{len(missed)} do not {missed[:1]}",
-            not missed,
-        )
-
-
-def _missed(axis: str, seed: int) -> str:
-    make, fault = partial(ConformanceRig, seed, axis=axis), FAULTS[seed % len(FAULTS)]
-    try:
-        if can_keep(fault.rule, make().capabilities):
-            random_moment(fault, make, seed)
-    except (AssertionError, UserError) as error:
-        return f"{seed} {fault.name}: {error}"
-    return ""
-
-
-CHECKS: tuple[Check, ...] = (many_steps, killed_nodes, faults_of_all_drives)
+CHECKS: tuple[Check, ...] = (killed_nodes,)

@@ -1,4 +1,4 @@
-"""No process is left when a node, its parent or a command ends."""
+"""No process is left when a node or its parent ends."""
 
 from __future__ import annotations
 
@@ -8,22 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
-from child_processes import ending_descendants, processes_with
 from needle_bringup.simulation.node_graph import NodeProcess, stop, wait_for
-
-# A child that starts another one in its own session.
-PARENT = """
-import signal, subprocess, sys
-ends = "import signal; print('on', flush=True); signal.pause()"
-with subprocess.Popen(
-    [sys.executable, "-c", ends], start_new_session=True, stdout=subprocess.PIPE
-) as process:
-    process.stdout.readline()
-    print("on", flush=True)
-    signal.pause()
-"""
 
 
 def test_children_of_a_node_end_with_it(tmp_path: Path) -> None:
@@ -58,21 +43,6 @@ time.sleep(1000)
     parent.wait()
     parent.stdout.close()
     assert_ends(child)
-
-
-def test_no_process_is_left_after_an_interrupt() -> None:
-    mark = {"NEEDLE_TEST_MARK": "descendants"}
-    with pytest.raises(KeyboardInterrupt), ending_descendants():
-        process = subprocess.Popen(
-            [sys.executable, "-c", PARENT], env={**os.environ, **mark}, stdout=subprocess.PIPE
-        )
-        assert process.stdout is not None
-        with process.stdout as output:
-            output.readline()
-        assert len(processes_with(*mark.popitem())) == 2
-        raise KeyboardInterrupt
-    process.wait()
-    assert processes_with("NEEDLE_TEST_MARK", "descendants") == []
 
 
 def assert_ends(pid: int) -> None:

@@ -43,10 +43,6 @@ def test_a_cluster_gives_the_figures_of_one_machine(
     alone = figures_of(tmp_path)
     assert figures_of(tmp_path, "--scheduler", two_workers.address) == alone
     assert "warning" not in capfd.readouterr().err
-    points = ("--targets", "30", "--controller", "sliding_mode")
-    assert figures_of(tmp_path, *points, "--scheduler", two_workers.address) == figures_of(
-        tmp_path, *points
-    )
 
 
 @NEEDED

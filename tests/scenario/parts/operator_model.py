@@ -48,13 +48,6 @@ class JoystickButtons:
         """Whether a button that could move the needle is pressed."""
         return self.insert or self.retract
 
-    @property
-    def button(self) -> str:
-        """Button of a page that is pressed; empty for none or more than one."""
-        if self.insert is self.retract or self.stop:
-            return ""
-        return "insert" if self.insert else "retract"
-
 
 class Joystick(c.Component):
     """Publishes the state of the buttons.
@@ -100,8 +93,6 @@ class OperatorModel(c.Component):
         Whether the controller was in state DONE once.
     absent : bool
         Whether it does nothing; the hand may still move.
-    shows_lost_press : callable
-        Returns whether its input device shows a lost press.
     extra_actions : list of Action
         Actions to send in the next period.
     """
@@ -116,7 +107,6 @@ class OperatorModel(c.Component):
         self.device, self.controller = DeviceStatus(), ControllerStatus()
         self.done = False
         self.absent = False
-        self.shows_lost_press: Callable[[float], bool] = lambda _: False
         self.extra_actions: list[c.Action] = []
         self._called: dict[str, float] = {}
         self._changed_at = 0.0
@@ -189,7 +179,7 @@ class OperatorModel(c.Component):
     def _press(self, now: float, *, insert: bool, retract: bool) -> None:
         """Release other buttons and stale presses; press the given button from neutral."""
         hand = self._hand
-        lost = self.device.press_again == self._source or self.shows_lost_press(now)
+        lost = self.device.press_again == self._source
         stale = hand.holds and (insert, retract) != (hand.insert, hand.retract)
         if hand.holds and (stale or lost):
             self._release(now)

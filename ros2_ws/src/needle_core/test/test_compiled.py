@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import pwd
 import random
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -35,16 +33,6 @@ def test_compiled_code_is_cached_in_the_users_cache_or_a_chosen_folder(
         monkeypatch.setenv(name, str(tmp_path / name))
         compiled._cache_directory.cache_clear()
         assert Path(compiled._cache_directory(package)).is_relative_to(tmp_path / name)
-
-
-def test_without_a_home_nothing_is_cached(
-    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("HOME")
-    nowhere = SimpleNamespace(pw_dir="/dev/null/nobody")
-    monkeypatch.setattr(pwd, "getpwuid", lambda _: nowhere)
-    assert compiled._cache_directory(package) == ""
-    assert not list((tmp_path / "tmp").iterdir())
 
 
 def test_code_edited_in_any_folder_of_its_package_is_recompiled(package: Path) -> None:

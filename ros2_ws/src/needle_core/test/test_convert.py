@@ -69,14 +69,6 @@ def test_a_message_round_trips_with_and_without_ros_and_across(message: Any) -> 
             assert from_ros(type(message), received) == message
 
 
-def test_a_plain_marker_looks_like_an_obstacle() -> None:
-    ball = m.Marker("rig", "bone", 4, 2, 0, (0.1, 0.2, 0.3), TURN, (0.6, 0.6, 0.6))
-    (marker,) = to_ros(m.Markers((ball,)), rclpy_types()).markers
-    color, stamp = marker.color, marker.header.stamp
-    assert (color.r, color.g, color.b, color.a) == (0.8, 0.2, 0.2, 0.5)
-    assert (stamp.sec, stamp.nanosec, list(marker.points)) == (0, 0, [])
-
-
 def test_the_frame_of_a_hold_is_its_source_and_session() -> None:
     joy = rclpy_types().make("sensor_msgs/msg/Joy")()
     joy.header.stamp.nanosec = 7

@@ -3,15 +3,6 @@
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 
-def test_keys_have_the_units_of_the_documents() -> None:
-    status = DeviceStatus(state="HOLDING", homed=True, insertion_m=0.01, speed_scale=1 / 3)
-    assert status.values["homed"] == "true"
-    assert status.values["insertion_m"] == "0.01"
-    assert status.values["rotation_rad"] == ""
-    assert status.values["speed_scale"] == "0.333"
-    assert "source" not in status.values
-
-
 def test_a_malformed_value_keeps_its_default() -> None:
     keys = ("starts", "insertion_m", "depth_m", "target_point_m", "r1_low_m", "reachable_depth_m")
     for text in ("nan", "inf", "-inf", "two", "", "1, 2", "1e999", "1, x, 3"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import math
 import os
 import signal
 import sys
@@ -15,7 +14,7 @@ from typing import Any, NoReturn
 import pytest
 
 from needle_core.commands import cli, executables
-from needle_core.commands.cli import internal_error, run_command, write_json
+from needle_core.commands.cli import run_command
 from needle_core.errors import UserError
 from needle_core.process import shutdown
 from needle_core.process.shutdown import ENDING_SIGNALS, ShutdownFlag, interruptible
@@ -55,19 +54,11 @@ def test_a_user_error_is_an_exit_code_and_one_line(
     assert capsys.readouterr().err == "error: kappa = -1 1/m\ninterrupted\n"
 
 
-def test_an_internal_error_is_one_line_and_in_development_a_traceback_before_it(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_internal_error_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(lambda: raise_(ValueError("two\nlines"))) == 3
     text = capsys.readouterr().err
     assert text.startswith("error: internal error, please report it: ValueError: two lines (test_c")
     assert text.count("\n") == 1
-    develops = types.SimpleNamespace(flags=types.SimpleNamespace(dev_mode=True), stderr=sys.stderr)
-    monkeypatch.setattr(cli, "sys", develops)
-    assert internal_error(ValueError("odd")) == 3
-    first, *_, last = capsys.readouterr().err.splitlines()
-    assert first == "ValueError: odd"
-    assert last.startswith("error: internal error")
 
 
 def test_a_closed_output_pipe_is_not_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,13 +68,6 @@ def test_a_closed_output_pipe_is_not_an_error(monkeypatch: pytest.MonkeyPatch) -
         with os.fdopen(writer, "w") as stream:
             monkeypatch.setattr(sys, "stdout", stream)
             assert run_command(lambda n=count: print("x" * n) or 1) == 0  # type: ignore[misc]
-
-
-def test_json_is_written_or_the_error_gives_the_reason(tmp_path: Path) -> None:
-    write_json(tmp_path / "file", {"a": math.inf})
-    assert (tmp_path / "file").read_text() == '{\n  "a": null\n}\n'
-    with pytest.raises(UserError, match=r"cannot write .*: Is a directory"):
-        write_json(tmp_path, {})
 
 
 # ---- signals ------------------------------------------------------------------------------------

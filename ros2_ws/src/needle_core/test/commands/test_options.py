@@ -18,19 +18,11 @@ from needle_core.commands.options import (
 from needle_core.errors import OutOfBoundsError, UserError
 
 
-def test_unknown_arguments_are_a_user_error_and_help_keeps_its_lines() -> None:
-    parser = CommandParser("study", "Runs,\nand says so.", "example:\n  study --seed 1")
+def test_options_cannot_be_abbreviated() -> None:
+    parser = CommandParser("study", "", "")
     parser.add_argument("--seed")
-    for argv, complaint in (
-        # Options cannot be abbreviated.
-        (["--see", "1"], "unrecognized arguments: --see 1; see --help"),
-        (["--seed"], "argument --seed: expected one argument; see --help"),
-    ):
-        with pytest.raises(UserError) as raised:
-            parser.parse_args(argv)
-        assert str(raised.value) == complaint
-    assert "Runs,\nand says so." in parser.format_help()
-    assert parser.format_help().endswith("example:\n  study --seed 1\n")
+    with pytest.raises(UserError, match="unrecognized arguments: --see 1; see --help"):
+        parser.parse_args(["--see", "1"])
 
 
 def test_numbers_are_parsed_and_bounded() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import os
 import shutil
 import struct
 from pathlib import Path
@@ -27,23 +26,18 @@ from .made_bags import (
 )
 
 
-@pytest.mark.parametrize("text", ["just text", "\x00", "a: [1", ""])
+@pytest.mark.parametrize("text", ["just text", "\x00", ""])
 def test_malformed_metadata_are_rejected(bag: Path, text: str) -> None:
     (bag / "metadata.yaml").write_text(text)
     assert "metadata.yaml" in reason(bag)
 
 
-def test_pipes_links_and_files_outside_of_the_bag_are_not_opened(bag: Path, tmp_path: Path) -> None:
-    for file in sorted(bag.iterdir(), reverse=True):
-        elsewhere = file.rename(tmp_path / file.name)
-        os.mkfifo(file)
-        assert f"{file.name}: it is not a regular file" in reason(bag)
-        file.unlink()
-        file.symlink_to(elsewhere)
-        assert f"{file.name}: it is a link" in reason(bag)
-        elsewhere.replace(file)
+def test_links_and_files_outside_of_the_bag_are_not_opened(bag: Path, tmp_path: Path) -> None:
     (file,) = bag.glob("*.mcap")
     elsewhere = file.rename(tmp_path / file.name)
+    file.symlink_to(elsewhere)
+    assert f"{file.name}: it is a link" in reason(bag)
+    file.unlink()
     for outside in (f"../{file.name}", str(elsewhere)):
         change(bag, relative_file_paths=[outside])
         assert "No such file" in reason(bag)
@@ -92,11 +86,8 @@ def test_an_incomplete_bag_is_reported_with_its_remedy(bag: Path, tmp_path: Path
     ("values", "words"),
     [
         ({"compression_mode": "FILE", "compression_format": "lz4"}, "compression 'lz4'"),
-        ({"compression_mode": "MESSAGE", "compression_format": "br"}, "compression 'br'"),
         ({"storage_identifier": "my_storage"}, "storage 'my_storage'"),
         ({"version": 10, "relative_file_paths": None}, "metadata.yaml has version 10"),
-        ({"version": 10, "topics_with_message_count": [{"topic": "/a"}]}, "has version 10"),
-        ({"version": 10, "message_count": None, "topics_with_message_count": 3}, "version 10"),
     ],
 )
 def test_an_unsupported_storage_is_not_reported_as_broken(

@@ -5,25 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from needle_core.errors import UserError
 from needle_core.files.yaml_files import load_yaml, read_yaml
-
-KEYS = st.text("ab1", min_size=1, max_size=2)
-VALUES = st.recursive(
-    st.none() | st.integers() | st.text("a1 :-#'\n\u00e9", max_size=3),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=3),
-    max_leaves=12,
-)
-
-
-@settings(deadline=None, max_examples=15, derandomize=True)
-@given(VALUES, st.sampled_from([None, True, False]))
-def test_yaml_without_duplicate_keys_is_read_unchanged(value: object, flow: bool | None) -> None:
-    assert load_yaml(yaml.safe_dump(value, default_flow_style=flow)) == value
 
 
 def test_a_duplicate_key_is_named_with_its_line() -> None:

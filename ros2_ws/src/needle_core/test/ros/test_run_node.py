@@ -12,7 +12,6 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from needle_core.errors import UserError
 from needle_core.ros import main
-from needle_core.ros.base_node import WholeNode
 from needle_core.ros.main import run_node
 
 
@@ -115,19 +114,3 @@ def test_arguments_are_explained_or_rejected_before_the_start(
         assert run(None, *argv) == 2
         assert cause in capsys.readouterr().err
     assert middleware.done == []
-
-
-def test_a_node_whose_construction_fails_is_destroyed() -> None:
-    gone: list[WholeNode] = []
-
-    class Half(WholeNode):
-        def __init__(self, error: Exception) -> None:
-            raise error
-
-        def destroy_node(self) -> None:
-            gone.append(self)
-            raise AttributeError("rclpy has not made its own part")
-
-    with pytest.raises(UserError, match="rate"):
-        Half(UserError("rate = 0 Hz, must be > 0"))
-    assert len(gone) == 1

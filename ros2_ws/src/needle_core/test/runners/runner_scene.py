@@ -18,10 +18,8 @@ from needle_core.component import (
     Moment,
     Output,
     Peers,
-    Port,
     Publish,
     Reply,
-    Send,
     Service,
     Timer,
 )
@@ -82,26 +80,6 @@ class Once(Component):
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
         self.answers.append(answer)
-        return ()
-
-
-class Wired(Component):
-    """Sends two batches per tick, and stores the arriving ones with their time."""
-
-    def __init__(self, name: str, *, sends: bool = False) -> None:
-        self.name = name
-        self.count = 0
-        self.arrived: list[tuple[float, int]] = []
-        self.ports = (Port("wire", self._receive),)
-        self.timers = (Timer(0.0005, self._send),) if sends else ()
-
-    def _send(self, at: Moment) -> Actions:
-        for _ in range(2):
-            self.count += 2
-            yield Send("wire", (self.count - 1, self.count))
-
-    def _receive(self, batch: Sequence[int], at: Moment) -> Actions:
-        self.arrived += [(at.steady, number) for number in batch]
         return ()
 
 

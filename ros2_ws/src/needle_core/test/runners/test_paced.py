@@ -99,15 +99,6 @@ def test_input_is_handled_at_the_time_of_the_wall_clock() -> None:
     assert scene.line.sent == ["0.503 heard", "0.507 heard"]
 
 
-def test_a_short_delay_is_made_up_for() -> None:
-    scene = Scene()
-    begin = scene.wall.now
-    scene.worker.takes = [0.8 * SLACK]
-    scene.runner.run(2.0)
-    assert scene.runner.lag == 0.0
-    assert scene.wall.now - begin == pytest.approx(2.0)
-
-
 @pytest.mark.parametrize("pace", [0.5, 1.0, 4.0])
 def test_a_long_delay_is_lost_and_reported_and_no_time_is_skipped(pace: float) -> None:
     scene = Scene(pace)

@@ -20,19 +20,17 @@ from needle_core.component import (
     Exit,
     Log,
     Moment,
-    Port,
-    PortChange,
     Publish,
     Reply,
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import EmergencyStop
 from needle_core.runners.timeline import START_NS
-from needle_core.runners.transport import Arrival, Arrivals, Fault, Link
+from needle_core.runners.transport import Arrival, Arrivals, Link
 from needle_core.runners.virtual import DISCOVERY, LEASE, VirtualRunner
-from scenario.transport_faults import delay, drop, duplicate, silence
+from scenario.transport_faults import delay
 
-from .runner_scene import Once, Receiver, Sender, Server, Wired, run
+from .runner_scene import Once, Receiver, Sender, Server, run
 
 NUMBER = 0
 """Number of a request, by which the server of the scene identifies it."""
@@ -52,16 +50,6 @@ def test_a_seed_determines_the_run() -> None:
     assert len(one) == pytest.approx(30, abs=1)
 
 
-def test_another_component_changes_no_draw_of_the_others() -> None:
-    alone, beside = Receiver(), Receiver()
-    run([Sender(), alone])
-    run([Once([]), Sender(), beside, Server()])
-    # Discovery events of the others keep the receiver busy.
-    settled = DISCOVERY[1] + 0.1
-    late = [[item for item in r.received if item[1].steady > settled] for r in (alone, beside)]
-    assert late[0] == late[1] != []
-
-
 def test_a_message_is_delayed_and_has_its_time_of_sending() -> None:
     receiver, late = Receiver(), Receiver()
     run([Sender(), receiver])
@@ -70,17 +58,6 @@ def test_a_message_is_delayed_and_has_its_time_of_sending() -> None:
         assert at.stamp_ns == START_NS + round(at.steady * 1e9)
     run([Sender(), late], faults=[delay("numbers", 0.4)])
     assert all(at.stamp_ns - at.sent_ns >= 400_000_000 for _, at in late.received)
-
-
-def test_a_component_receives_its_own_messages() -> None:
-    class Echo(Sender, Receiver):
-        def __init__(self) -> None:
-            Receiver.__init__(self)
-            Sender.__init__(self, "echo")
-
-    echo = Echo()
-    run([echo])
-    assert echo.numbers == list(range(1, len(echo.numbers) + 1)) != []
 
 
 def test_messages_before_discovery_are_lost_unless_latched() -> None:
@@ -114,23 +91,6 @@ def test_messages_keep_their_order_unless_a_fault_lets_one_overtake() -> None:
         assert {5, 6, 7, 8, 9, 10} <= set(receiver.numbers)
 
 
-def test_faults_drop_duplicate_and_silence_the_selected_messages() -> None:
-    def numbers(*faults: Fault) -> list[int]:
-        receiver = Receiver()
-        run([Sender(), receiver], seed=1, faults=faults)
-        return receiver.numbers
-
-    whole = numbers()
-    assert numbers(drop("others", 1.0)) == whole
-    assert numbers(drop("numbers", 1.0)) == []
-    assert 0 < len(numbers(drop("numbers", 0.5))) < len(whole)
-    twice = numbers(duplicate("numbers", 0.15))
-    assert [twice.count(number) for number in range(5, 25)] == [2] * 20
-    lost = set(whole) - set(numbers(silence("sender", 1.0, 1.5)))
-    assert len(lost) == 5
-    assert max(lost) - min(lost) == 4
-
-
 # ---- services and actions -----------------------------------------------------------------------
 
 
@@ -145,17 +105,6 @@ def test_a_call_is_answered_once_or_fails_after_its_timeout() -> None:
         run([once, *servers], seconds=1.0 + ANSWER_TIMEOUT)
         assert once.answers == [answer]
     assert [on for _, on in server.asked] == [True]
-
-
-def test_faults_apply_to_calls_and_their_answers() -> None:
-    once, server = Once([Call("serve", True)]), Server(Reply(NUMBER, True))
-    run([once, server], faults=[duplicate("serve", 0.1)])
-    first, second = server.asked
-    assert first == second
-    assert len(once.answers) == 1
-    once, server = Once([Call("serve", True)]), Server(Reply(NUMBER, True))
-    run([once, server], faults=[drop("serve", 1.0)])
-    assert (server.asked, once.answers) == ([], [])
 
 
 def test_a_handler_that_raises_is_reported_and_ends_nothing() -> None:
@@ -195,79 +144,6 @@ def test_a_component_that_exits_does_nothing_more_and_ends_the_run() -> None:
     assert runner.exits["sender"] == Exit(0)
     with pytest.raises(ValueError, match="no component 'nobody'"):
         runner.stop("nobody")
-
-
-# ---- ports --------------------------------------------------------------------------------------
-
-
-def test_a_batch_arrives_in_order_at_all_ports_of_the_same_name() -> None:
-    one, other, third = Wired("one", sends=True), Wired("other"), Wired("third")
-    third.ports = (Port("another wire", third._receive),)
-    VirtualRunner([one, other, third]).run(0.1)
-    numbers = [number for _, number in other.arrived]
-    # Ports are connected at once, while discovery takes time.
-    assert numbers == list(range(1, len(numbers) + 1))
-    assert one.count - 12 < len(numbers) <= one.count
-    assert other.arrived[0][0] < 0.003
-    assert one.arrived == third.arrived == []
-    one, other = Wired("one", sends=True), Wired("other")
-    VirtualRunner([one, other], faults=(drop("wire", 0.5),)).run(0.1)
-    assert 0.3 * one.count < len(other.arrived) < 0.7 * one.count
-
-
-def test_waiting_input_of_a_port_is_one_batch() -> None:
-    batches: list[int] = []
-    one, other = Wired("one", sends=True), Wired("other")
-
-    def receive(batch: Sequence[int], at: Moment) -> Actions:
-        batches.append(len(batch))
-        return other._receive(batch, at)
-
-    other.ports = (Port("wire", receive),)
-    runner, published = run([one, other], seconds=0.0)
-    runner.run(0.1)
-    assert max(batches) <= 6
-    runner.freeze("other", 0.1)
-    runner.run(0.2)
-    assert max(batches) > 100
-    assert published == []
-    numbers = [number for _, number in other.arrived]
-    assert numbers == list(range(1, len(numbers) + 1))
-
-
-def test_a_port_is_lost_and_reopened_also_for_a_component_that_starts_meanwhile() -> None:
-    changes: list[str] = []
-
-    def wired(name: str, *, sends: bool = False) -> Wired:
-        component = Wired(name, sends=sends)
-        component.ports = (Port("wire", component._receive, note),)
-        return component
-
-    def note(change: PortChange, at: Moment) -> Actions:
-        changes.append(change.lost)
-        return ()
-
-    one, other = wired("one", sends=True), wired("other")
-    runner = VirtualRunner([one, other])
-    runner.run(0.1)
-    runner.lose_port("other", "wire", "unplugged")
-    runner.run(0.1)
-    assert 0 < len(other.arrived) < one.count - 100
-    runner.kill("other")
-    anew = wired("other")
-    runner.start(anew)
-    runner.run(0.1)
-    assert anew.arrived == []
-    runner.open_port("other", "wire")
-    runner.run(0.1)
-    assert anew.arrived
-    assert changes == ["unplugged", "unplugged", ""]
-    # A lost port does not send either.
-    runner.lose_port("one", "wire", "full")
-    runner.run(0.001)
-    arrived = len(anew.arrived)
-    runner.run(0.1)
-    assert len(anew.arrived) == arrived
 
 
 # ---- life of components and faults --------------------------------------------------------------
@@ -319,26 +195,3 @@ def test_a_killed_component_loses_its_state_and_is_dropped_after_its_lease() -> 
     assert "numbers" not in receiver.peers[-1].publishers
     runner.start(Sender())
     assert runner.exits == {}
-
-
-def test_a_component_that_is_slowed_down_falls_behind_for_a_while() -> None:
-    receiver = Receiver()
-    runner = VirtualRunner([Sender(), receiver], seed=1)
-    runner.run(1.0)
-    runner.slow_down("receiver", 1.0, 0.25)
-    runner.run(1.0)
-    assert len(receiver.numbers) < 15
-    runner.run(1.0)
-    assert receiver.numbers[-10:] == list(range(receiver.numbers[-1] - 9, receiver.numbers[-1] + 1))
-
-
-def test_settings_and_the_clock_of_stamps_may_change() -> None:
-    class Settled(Sender):
-        def on_settings(self, settings: Any, at: Moment) -> Actions:
-            yield Log("info", f"{settings} at {at.steady:.1f}, {at.stamp_ns // 10**8}")
-
-    runner, published = run([Settled()], seconds=1.0)
-    runner.timeline.clock_offset_ns = -500_000_000
-    runner.configure("sender", 7)
-    runner.run(0.01)
-    assert texts(published) == ["7 at 1.0, 15"]

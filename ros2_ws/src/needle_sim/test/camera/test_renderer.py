@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-import cv2
 import numpy as np
 import pytest
 
-from needle_core.errors import OutOfBoundsError, UserError
 from needle_sim.camera.optics import project
 from needle_sim.camera.renderer import StereoRenderer
-from needle_sim.camera.scenarios import CLEAN, Scenario
+from needle_sim.camera.scenarios import CLEAN
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.camera.stroke import stroke
 from needle_sim.needle.needle_shape import NeedleShape
@@ -68,21 +66,6 @@ def test_noise_follows_the_scenario_and_differs_by_exposure_camera_and_seed(rig:
         assert taken(render(other, None, 0), first)[0].std() > level
     still = StereoRenderer(rig, 5, scenario=STILL)
     np.testing.assert_array_equal(render(still, None, 0), render(still, None, 1))
-    with pytest.raises(OutOfBoundsError, match=r"noise = 51 grey levels"):
-        Scenario("loud", "too much", noise=51.0)
-
-
-def test_clean_images_are_unchanged(rig: StereoRig) -> None:
-    left, _ = render(StereoRenderer(rig, 5), needle(0.08), 7)
-    assert left.dtype == np.uint8
-    assert left.shape == (768, 1024)
-    golden = cv2.imread(f"{__file__.rpartition('/')[0]}/data/clean_tip.png", cv2.IMREAD_GRAYSCALE)
-    assert golden is not None
-    u, v = project(needle(0.08).T_rig_tip[:3, 3], rig.left).astype(int)
-    difference = np.abs(left[v - 40 : v + 40, u - 80 : u + 40].astype(int) - golden)
-    # Other processors blur the mottle with different rounding.
-    assert difference.max() <= 1
-    assert np.mean(difference > 0) < 0.01
 
 
 def test_any_insertion_can_be_rendered_and_a_needle_that_is_out_is_not_drawn(
@@ -97,7 +80,7 @@ def test_any_insertion_can_be_rendered_and_a_needle_that_is_out_is_not_drawn(
     assert taken(render(renderer, needle(0.3, 5.0, 170.0), 3), nothing).max() > 20.0
 
 
-def test_a_stroke_covers_its_area_about_its_middle_and_is_cut_at_the_edges() -> None:
+def test_a_stroke_covers_its_area_about_its_middle() -> None:
     for angle in np.deg2rad([0.0, 7.0, 45.0, 123.0, 270.0]):
         direction = np.array([np.cos(angle), np.sin(angle)])
         line = np.array([50.3, 50.6]) + np.linspace(-20.0, 20.0, 21)[:, np.newaxis] * direction
@@ -109,10 +92,6 @@ def test_a_stroke_covers_its_area_about_its_middle_and_is_cut_at_the_edges() -> 
         assert (image * columns).sum() / image.sum() == pytest.approx(50.3, abs=2e-3)
         assert (image * rows).sum() / image.sum() == pytest.approx(50.6, abs=2e-3)
         assert image.max() <= 1.0
-    line = np.stack([np.linspace(-30.0, 30.0, 31), np.full(31, 1.0)], axis=-1)
-    seen = stroke(line, np.full(31, 2.0), 0.7, (20, 10))
-    assert seen.row.min() >= 0
-    assert seen.column.max() == 19
 
 
 def test_the_bend_turns_by_its_angle_and_ends_at_the_tip() -> None:
@@ -135,21 +114,3 @@ def test_the_bend_turns_by_its_angle_and_ends_at_the_tip() -> None:
     assert np.rad2deg(np.arccos(before @ direction)) == pytest.approx(10.0, abs=0.1)
     np.testing.assert_allclose(local[local[:, 2] < -0.032, 1], 0.0, atol=1e-12)
     np.testing.assert_allclose(local[:, 0], 0.0, atol=1e-12)
-
-
-def test_a_short_path_draws_only_the_part_inside() -> None:
-    plant = needle(0.004, 0.0, 0.0)
-    line = NeedleShape().shaft_centreline(plant.T_rig_tip, plant.centreline(0.001), 0.0003)
-    # Up to the point where the bend leaves the path.
-    assert line[0, 2] == pytest.approx(0.0, abs=5e-5)
-    for length in (0.0, 1e-16, 1e-9):
-        point = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, length]])
-        assert NeedleShape().shaft_centreline(np.eye(4), point, 0.0003).shape == (0, 3)
-
-
-def test_a_needle_may_be_straight_but_not_lean_farther_than_it_bends() -> None:
-    straight = NeedleShape(bend_angle=0.0, lean=0.0)
-    np.testing.assert_array_equal(straight.lateral_offset(np.linspace(0.0, 0.1, 50)), 0.0)
-    for bend, lean in ((0.1, 0.1), (0.1, 0.0), (0.1, -0.05), (0.0, 0.05)):
-        with pytest.raises(UserError, match=r"lean = \S+ rad, expected above 0 and less than"):
-            NeedleShape(bend_angle=bend, lean=lean)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -64,52 +63,6 @@ def test_an_unplugged_adapter_is_an_error_and_reconnects(port: PtyCan) -> None:
     with computer(port) as bus:
         bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         assert received(port) == (CanFrame(0x80),)
-
-
-def test_a_port_is_read_until_it_is_closed(tmp_path: Path) -> None:
-    adapter = PtyCan(tmp_path / "can")
-    received: list[CanFrame] = []
-
-    def arrive(frames: tuple[CanFrame, ...]) -> None:
-        received.extend(frames)
-        adapter.send((CanFrame(0x181, b"\1"),))
-        message = bus.recv(1.0)
-        assert message is not None
-        received.append(CanFrame(message.arbitration_id, bytes(message.data)))
-        adapter.close()
-
-    bus = computer(adapter)
-    bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-    adapter.read(arrive)
-    assert received == [CanFrame(0x80), CanFrame(0x181, b"\1")]
-    assert list(tmp_path.iterdir()) == []
-    bus.serialPortOrig.close()
-    bus._is_shutdown = True
-
-
-def read(terminal: int, count: int) -> bytes:
-    """Return a number of bytes; a terminal may deliver them in any pieces."""
-    data = b""
-    while len(data) < count:
-        data += os.read(terminal, count - len(data))
-    return data
-
-
-def test_closing_the_channel_drops_pending_output_and_opening_it_does_not(port: PtyCan) -> None:
-    terminal = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
-    try:
-        for words in (b"C\r", b"S6\r", b"O\r"):
-            os.write(terminal, words)
-            port.receive()
-        # A waiting reader has been notified of the input.
-        assert read(terminal, 3) == b"\r\r\r"
-        port.send([CanFrame(0x181, b"\1")])
-        for words in (b"C\r", b"N\r"):
-            os.write(terminal, words)
-            port.receive()
-        assert read(terminal, 7) == b"\rNSIM1\r"
-    finally:
-        os.close(terminal)
 
 
 def test_files_and_links_of_others_are_left_alone(tmp_path: Path) -> None:

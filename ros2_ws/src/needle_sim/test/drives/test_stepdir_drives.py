@@ -96,28 +96,6 @@ def test_a_lost_or_foreign_line_stops_both_axes(skip: int) -> None:
     assert 8000 * 0.03 < position < 8000 * 0.05 + 50
 
 
-def test_a_damaged_line_is_dropped_and_missed() -> None:
-    computer = Computer()
-    computer.switch_on(0)
-    damaged = f"${computer.number},M,0,100,25*00\n".encode()
-    computer.number += 1
-    assert computer.board.receive((damaged,), computer.now) == []
-    assert computer.status() == [2, 0, ON | SET_UP, 0, 0]
-
-
-def test_lost_steps_are_counted_and_not_made() -> None:
-    computer = Computer()
-    computer.switch_on(0)
-    computer.board.stall("insertion")
-    computer.send("M,0,800,100")
-    assert computer.wait(0.2)[1] == 800
-    assert computer.place == pytest.approx(1000 / 1.6e6)
-    computer.board.restore(computer.now)
-    computer.send("M,0,1600,100")
-    assert computer.wait(0.2)[1] == 1600
-    assert computer.place == pytest.approx(1800 / 1.6e6)
-
-
 @pytest.mark.parametrize(
     ("start", "target", "switch"), [(100.0, -5000, OUTER), (399_900.0, 5000, INNER)]
 )
@@ -130,22 +108,6 @@ def test_a_switch_blocks_its_direction_only(start: float, target: int, switch: i
     assert 100 < abs(position) < 160
     computer.send("M,0,0,25")
     assert computer.wait(0.2)[1:3] == [0, ON | SET_UP]
-
-
-def test_orders_need_power_and_power_needs_a_set_up() -> None:
-    computer = Computer()
-    computer.send("P,0,1")
-    computer.send("M,0,100,25")
-    assert computer.wait(0.1) == [0, 0, 0, 0, 0]
-    computer.switch_on(0)
-    # The step rate of the board is limited.
-    computer.send("C,0,100000000,-1,100")
-    computer.send("M,0,100000,1")
-    start = computer.status(after=0.05)[1]
-    assert computer.status(after=0.05)[1] - start == pytest.approx(5000, abs=2)
-    computer.board.reboot("insertion", computer.now)
-    assert computer.send("S") == ""
-    assert computer.status(after=1.0) == [0, 0, 0, 0, 0]
 
 
 @pytest.mark.skipif(not shutil.which("g++"), reason="compiles the sketch")

@@ -64,43 +64,6 @@ def test_a_fault_of_the_line(fault: dict[str, float], answers: dict[float, list[
         assert drives.poll(now) == expected
 
 
-def test_a_hung_processor_is_silent_and_its_motor_ends_at_the_set_point() -> None:
-    drives = Drives()
-    drives.receive((b"go;",), 0.0)
-    drives.poll(0.05)
-    drives.hang("rotation")
-    seen = len(drives.watched)
-    assert drives.receive((b"a;",), 0.06) == drives.poll(1.0) == []
-    assert drives.axes(1.0)["insertion"].position == pytest.approx(0.1)
-    assert len(drives.watched) == seen
-    drives.restore(1.0)
-    assert drives.receive((b"b;",), 1.0) == [b"<b>"]
-
-
-def test_a_reboot_stops_the_motor_and_forgets_the_count() -> None:
-    drives = Drives()
-    drives.receive((b"go;half",), 0.0)
-    drives.poll(0.05)
-    drives.reboot("rotation", 0.05)
-    assert drives.axes(0.5)["insertion"].position == pytest.approx(0.05)
-    assert drives.drives["insertion"].position == 0
-    assert drives.receive((b"a;",), 0.1) == []
-    assert drives.receive((b"a;",), 0.5) == [b"<a>"]
-    drives.foreign("go")
-    assert drives.axes(1.0)["insertion"].position == pytest.approx(0.1)
-
-
-def test_a_stalled_motor_rests_and_a_fault_switches_off() -> None:
-    drives = Drives()
-    drives.stall("insertion")
-    drives.receive((b"go;",), 0.0)
-    assert drives.axes(0.05)["insertion"].position == 0.0
-    drives.fail("insertion", 7)
-    drives.restore(0.05)
-    assert drives.axes(1.0)["insertion"].position == 0.0
-    assert drives.states() == {"insertion": "FAULT 0x0007", "rotation": "OFF"}
-
-
 # ---- drive_emulator ---------------------------------------------------------------------------
 
 

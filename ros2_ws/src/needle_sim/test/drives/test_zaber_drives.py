@@ -126,31 +126,3 @@ def test_a_stall_is_measured_and_acknowledged() -> None:
     assert chain.send("1 1 move abs 0") == "@01 1 OK BUSY FS 0\r\n"
     chain.send("1 warnings clear", 3.0)
     assert chain.send("1 1 get pos") == "@01 1 OK IDLE -- 0\r\n"
-
-
-def test_a_device_without_encoder_does_not_notice_a_stall() -> None:
-    chain = Chain().homed()
-    chain.drives.drives["insertion"].has_encoder = False
-    chain.drives.stall("insertion")
-    chain.send("1 1 move abs 5000")
-    assert chain.value("pos", 1.0) == 5000
-    assert abs(chain.place) < 1e-3
-    assert "RJ" in chain.send("1 1 get encoder.pos")
-
-
-def test_a_loss_of_power_loses_the_reference_but_no_setting() -> None:
-    chain = Chain().homed()
-    chain.send("1 1 move abs 50000")
-    chain.now += 0.5
-    chain.drives.reboot("insertion", chain.now)
-    place = chain.place
-    assert chain.send("get pos", 0.1).startswith("@02 0")
-    assert chain.send("1 1 get maxspeed", 0.4) == "@01 1 OK IDLE WR 32768\r\n"
-    assert chain.place == place
-    assert chain.value("pos") == TRAVEL * SCALE
-    assert "WR" in chain.send("2 warnings")
-
-
-def test_a_device_alone_keeps_its_address() -> None:
-    drives = ZaberDrives({"rotation": MotorSettings(1000.0, 20_000.0)}, -1.0)
-    assert drives.receive((b"/1 0\n/2 0\n",), 0.0) == [b"@02 0 OK IDLE WR 0\r\n"]

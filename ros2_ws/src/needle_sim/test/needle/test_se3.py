@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from scipy.linalg import expm
 
 from needle_sim.needle.se3 import exp_twist
@@ -26,8 +25,3 @@ def test_twists_of_any_angle_one_or_many_have_the_matrix_exponential() -> None:
     for index in np.ndindex(10, len(ANGLES)):
         np.testing.assert_allclose(together[index], exponential(twists[index]), rtol=0, atol=3e-14)
     np.testing.assert_allclose(exp_twist(twists[0, 1]), together[0, 1], rtol=0, atol=1e-15)
-
-
-def test_a_twist_of_another_length_is_refused() -> None:
-    with pytest.raises(ValueError, match="shape"):
-        exp_twist(np.zeros(5))

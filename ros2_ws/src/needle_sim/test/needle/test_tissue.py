@@ -38,9 +38,3 @@ def test_the_lag_follows_its_differential_equation_both_ways() -> None:
         ).y[0, -1]
         base += turned
         assert float(torsion.tip_angle) == pytest.approx(tip, abs=1e-8)
-
-
-def test_bad_figures_are_refused() -> None:
-    for bad in ({"play": -0.1}, {"lag_length": np.nan}, {"play": [0.0, np.inf]}):
-        with pytest.raises(ValueError, match="must be finite and not negative"):
-            Torsion(**bad)

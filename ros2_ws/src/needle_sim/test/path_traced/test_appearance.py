@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from needle_sim.path_traced import floors
 from needle_sim.path_traced.appearance import (
     APPEARANCES,
     FLOORS,
@@ -33,16 +32,6 @@ def test_a_name_fixes_its_properties_and_the_seed_draws_the_others_in_full_range
             for kind in ("metal", "lamps", "floor"):
                 assert getattr(fixed, kind) in (None, getattr(look, kind))
         assert len({look.floor_level for look in looks}) == 5
-
-
-def test_a_floor_reflects_a_share_of_the_light_and_repeats(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(floors, "_SHAPE", (500, 650))
-    for floor in FLOORS:
-        first, second = (floors.floor_picture(floor, np.random.default_rng(3)) for _ in range(2))
-        np.testing.assert_array_equal(first, second)
-        assert 0.01 <= first.min() < first.max() <= 0.95
 
 
 def test_the_sensor_blooms_saturates_and_is_noisy() -> None:

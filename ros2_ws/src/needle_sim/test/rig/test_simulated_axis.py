@@ -55,13 +55,3 @@ def test_an_axis_that_is_off_stopped_or_at_fault_does_not_move() -> None:
     run_at_once(axis.reset())
     run_at_once(axis.home(1.0))
     assert (axis.poll(7.0).homed, axis.poll(7.0).time) == (True, 7.0)
-
-
-def test_homing_goes_to_zero_and_is_not_homed_until_there() -> None:
-    axis = powered("rotation", position=0.05)
-    run_at_once(axis.home(1.0))
-    assert (axis.poll(0.0).homed, axis.poll(0.0).moving) == (False, True)
-    for _ in range(3):
-        axis.advance(PERIOD)
-    assert axis.position == 0.0
-    assert (axis.poll(0.0).homed, axis.poll(0.0).moving) == (True, False)

@@ -49,11 +49,6 @@ def test_settled_is_the_last_entry_into_the_band_and_converged_has_two_readings(
     np.testing.assert_array_equal(last_steps, [True, True, True, False, False, True])
 
 
-def test_a_run_that_missed_diverged_only_if_it_is_farther_than_ever_and_moving_away() -> None:
-    away, coming = np.linspace(0.001, 0.010, 51), np.linspace(0.012, 0.002, 51)
-    np.testing.assert_array_equal(outcomes(away, coming, path()).diverged, [True, False, False])
-
-
 def test_figures_of_known_runs() -> None:
     known = [path((0, 0.003), (10, 0.0005)), path((0, -0.002))]
     seen = figures(outcomes(*known, turns=0.1))

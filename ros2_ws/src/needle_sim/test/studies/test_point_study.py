@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from needle_bringup.studies.study_controllers import (
     CURVATURE,
     STEP_LENGTH,
-    point_controller_factory,
 )
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.disturbances import Disturbances
@@ -125,14 +124,3 @@ def test_each_needle_ends_at_its_own_point_with_a_short_last_step() -> None:
     shallow = dataclasses.replace(STRAIGHT, depth=0.0155)
     found = run_point_study(np.zeros((2, 3)), targets, Straight, shallow)
     assert found.error[1] == pytest.approx(np.hypot(0.002, 0.0048), abs=1e-6)
-
-
-def test_best_reaches_points_that_drift_and_breathe() -> None:
-    noisy = StudySettings(CURVATURE, 0.150, STEP_LENGTH, Disturbances(noise=0.001), seed=7)
-    places = random_targets(STARTS, CURVATURE, 7)
-    near = np.argsort(places[:, 2])[:5]
-    starts, moving = STARTS[near], MovingTargets(places[near], 0.002 / 60.0, 0.003, seed=7)
-    found = run_point_study(starts, moving, point_controller_factory("best", 0.001), noisy)
-    # 0.25 mm for thousands of needles; 2.2 mm without prediction.
-    assert np.sqrt(np.mean(found.error**2)) < 0.0005
-    assert np.rad2deg(np.mean(found.rotation)) < 1300.0

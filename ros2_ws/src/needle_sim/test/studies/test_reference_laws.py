@@ -9,7 +9,7 @@ import pytest
 
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.reference_laws import DutyCycle, is_clear, plan, sliding_mode_rate
+from needle_sim.studies.reference_laws import DutyCycle, plan, sliding_mode_rate
 
 CURVATURE = 1.0 / 0.122
 RATE = np.deg2rad(30.0) / 0.001
@@ -68,13 +68,3 @@ def test_a_planned_needle_reaches_its_target_past_an_obstacle(obstacles: FloatAr
     assert miss < 0.001
     # Without the obstacle the needle would pass through the ball.
     assert (least > 0.0) == bool(len(obstacles))
-
-
-def test_a_target_without_a_path_is_reported() -> None:
-    arc, chance = np.full(3, 7.0), np.random.default_rng(5).random((100, 4))
-    aside = np.array([0.05, 0.0, 0.02])
-    assert not plan(np.zeros(3), np.eye(3), aside, FREE, CURVATURE, 0.001, chance, arc)
-    np.testing.assert_array_equal(arc, 7.0)
-    straight, bend = np.array([0.0, 0.0, 1.0]), np.zeros(3)
-    assert is_clear(np.zeros(3), straight, bend, 0.03, BALL, 0.001)
-    assert not is_clear(np.zeros(3), straight, bend, 0.05, BALL, 0.001)

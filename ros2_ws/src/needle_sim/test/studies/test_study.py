@@ -189,12 +189,6 @@ def test_outcomes_follow_the_seed_and_not_the_chunks() -> None:
     assert not np.any(values(dataclasses.replace(disturbed, seed=2))[:, 0] == whole[:, 0])
 
 
-def test_the_last_step_ends_at_the_depth() -> None:
-    watching, found = watched(STARTS[:1], depth=0.0105)
-    np.testing.assert_allclose(watching.lengths, [0.001] * 10 + [0.0005])
-    assert found.x_last.shape == (1, 11)
-
-
 def test_a_bump_moves_the_needle_once_at_half_the_depth_and_not_the_plane() -> None:
     still, calm = watched(STARTS, depth=0.030)
     watching, found = watched(STARTS, depth=0.030, disturbances=Disturbances(bump=0.002))
@@ -229,10 +223,3 @@ def test_estimates_are_compared_with_the_truth_of_their_step() -> None:
     # x is known, the pitch is not.
     pitched = run_study(flat + np.array([0.0, 0.1, 0.0]), Knowing, settings(depth=0.030))
     np.testing.assert_array_equal(pitched.inside_3_sigma, 0.5)
-
-
-def test_the_controller_of_the_paper_steers_needles_to_the_plane() -> None:
-    noisy = settings(disturbances=Disturbances(noise=0.001), seed=7)
-    found = run_study(STARTS, controller_factory("paper", 0.001), noisy)
-    assert np.mean(found.converged_at_end) >= 0.9
-    assert not np.any(found.diverged)
