@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from campaign.benchmarks import reference_loop, study_benchmark
+from campaign.benchmarks import drive_benchmark, reference_loop, study_benchmark
 from needle_bringup.studies.study_controllers import controller_factory
 from needle_sim.studies.study import run_study
 
@@ -33,3 +33,11 @@ def test_python_control_simulates_the_same_loop() -> None:
     assert reference_loop.control_steer(system, start, noise) == pytest.approx(
         reference_loop.steer(start, noise, design), abs=1e-12
     )
+
+
+@pytest.mark.parametrize("name", drive_benchmark.CLIENTS)
+def test_each_client_is_measured_until_the_sync(name: str) -> None:
+    delays, share = drive_benchmark.measure(drive_benchmark.CLIENTS[name], 8)
+    assert len(delays) == 8
+    assert min(delays) > 0.0
+    assert share > 0.0

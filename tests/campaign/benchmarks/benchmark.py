@@ -7,10 +7,12 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 
 from campaign.benchmarks import (
+    drive_benchmark,
     latency_benchmark,
     link_benchmark,
     recording_benchmark,
     study_benchmark,
+    tracker_benchmark,
 )
 from campaign.benchmarks.figure_rows import Row
 from child_processes import ending_descendants
@@ -38,7 +40,11 @@ exit codes: 0 done; 2 invalid input; 130 interrupted
 BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
     "studies": study_benchmark.studies,
     "updates": study_benchmark.updates,
+    "memory": study_benchmark.memory,
+    "tracker": tracker_benchmark.rows,
     "recording": recording_benchmark.writer_rows,
+    "reception": recording_benchmark.reception_rows,
+    "drives": drive_benchmark.rows,
     "latency": latency_benchmark.rows,
     "link": link_benchmark.rows,
 }

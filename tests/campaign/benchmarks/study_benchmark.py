@@ -1,9 +1,10 @@
-"""Speed of studies and of the node's update, compared with the reference loops."""
+"""Speed and memory of studies and of the node's update, compared with the reference loops."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
@@ -91,6 +92,14 @@ def updates() -> Iterator[Row]:
             yield Row(f"update_{name}", what, "us", seconds, against, reference)
 
 
+def memory() -> Iterator[Row]:
+    """Yield the peak memory of a study, which must not grow with the number of steps."""
+    for name in ("paper", "best"):
+        short, long = (_peak_memory(name, depth) for depth in (0.030, 0.120))
+        what = f"{name}, memory of 1,000 x {STEPS}"
+        yield Row(f"memory_{name}", what, "MB", long, "1,000 x 30 steps", short)
+
+
 def noise_of(needle: int) -> list[float]:
     """Return the noise on x of one needle of the study [m]."""
     shares = (uniform_numbers(1, NOISE, k, needle, 1)[0, 0] for k in range(STEPS))
@@ -113,6 +122,17 @@ def _control_study() -> float:
     for needle in needles:
         reference_loop.control_steer(system, *needle)
     return (time.process_time() - begin) * NEEDLES / len(needles)
+
+
+def _peak_memory(name: str, depth: float) -> float:
+    settings = dataclasses.replace(STUDY, depth=depth)
+    factory = controller_factory(name, TIP_NOISE)
+    run_study(STARTS[:2], factory, settings)
+    tracemalloc.start()
+    run_study(STARTS[:1000], factory, settings)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return peak / 1e6
 
 
 def _study_one_by_one(name: str) -> float:

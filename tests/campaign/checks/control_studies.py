@@ -134,6 +134,16 @@ WANDERING = tuple(
     )
 )
 """Random walks of heading, roll or bias, and other disturbances."""
+_COMPARED = (
+    *("normal_noise", "noise_13", "noise_20", "outliers", "slip_5", "play_40", "lag_8", "kappa_08"),
+    *("kappa_12", "late", "flips"),
+)
+COMPARED = {
+    BEST.key: BEST,
+    **{study.key: study for study in TROUBLE + MISINFORMED if study.key in _COMPARED},
+    **{study.key: study for study in WANDERING},
+}
+"""Rows of the estimator table, by key."""
 REACHED = "within_1_mm_point"
 _WELL = ("--noise-mm", "0.05", "--claimed-mm", "0.05")
 _MOVING = ("--target-drift-mm-per-s", "0.0333", "--target-breath-mm", "3")
