@@ -1,4 +1,4 @@
-"""The recorder compared with rosbags' writer and the disk alone."""
+"""The recorder compared with rosbags' writer, the disk alone and the images sent."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from campaign.benchmarks.figure_rows import Row
+from campaign.trials.recording_trials import record_full_rate
 from needle_bags.format.bag_writer import BagWriter, standard_topic
 from needle_bags.recording.recording import reuse_freed_memory
 
 EXPOSURES = 150
+SECONDS = 20.0
 SMALL_EACH = 10
 _IMAGE = "sensor_msgs/msg/Image"
 _SMALL = "sensor_msgs/msg/JointState"
@@ -88,3 +90,15 @@ def _write_plainly(path: Path, messages: Iterator[Message]) -> None:
     with (path / "data").open("wb") as stream:
         for _, _, data in messages:
             stream.write(data)
+
+
+def reception_rows() -> Iterator[Row]:
+    """Yield the recorded share of stereo images at 2 x 30 Hz over DDS, and the CPU share."""
+    with tempfile.TemporaryDirectory(prefix="needle_bench_") as folder:
+        found = record_full_rate(Path(folder), SECONDS, others=0)
+    images = 2 * 30.0 * SECONDS
+    lost = sum(found["missing"].get(f"/stereo/{side}/image_raw", 0) for side in ("left", "right"))
+    recorded = 100.0 * (1.0 - lost / images)
+    yield Row("stereo_received", "stereo recorded", "%", recorded, "images sent", 100.0)
+    core = 100.0 * found["share"]
+    yield Row("recorder_core", "recorder, share of a core", "%", core, "one core", 100.0)

@@ -1,8 +1,8 @@
 """Publishes stereo images and all other topics of a rig at full rate.
 
-`python -m campaign.trials.recording_load SECONDS`: the nanoseconds of every header's stamp are the
-message's number on its topic, from 0. Begins when a node named recorder listens to every topic;
-prints, as JSON, the number of messages sent on each topic.
+`python -m campaign.trials.recording_load SECONDS [small]`: the nanoseconds of every header's stamp
+are the message's number on its topic, from 0. Begins when a node named recorder listens to every
+topic; prints, as JSON, the number of messages sent on each topic. `small` leaves the images out.
 """
 
 from __future__ import annotations
@@ -52,14 +52,15 @@ STREAMS: Final = (
 _STAMP: Final = 4  # after the four bytes of the CDR encapsulation header
 
 
-def main(duration: float) -> None:
+def main(duration: float, *, images: bool) -> None:
     """Publish for a duration [s]; print the number of messages by topic."""
     restrict_discovery()
     rclpy.init(args=[])
     node = WholeNode("recording_load")
-    publishers = [node.create_publisher(kind, name, qos) for name, kind, _, qos in STREAMS]
-    data = [bytearray(serialize_message(_example(kind))) for _, kind, _, _ in STREAMS]
-    counts = [0] * len(STREAMS)
+    chosen = [stream for stream in STREAMS if images or stream[1] is not Image]
+    publishers = [node.create_publisher(kind, name, qos) for name, kind, _, qos in chosen]
+    data = [bytearray(serialize_message(_example(kind))) for _, kind, _, _ in chosen]
+    counts = [0] * len(chosen)
     while not all(
         any(name.endswith("/recorder") for name in subscribers_of(node, publisher.topic_name))
         for publisher in publishers
@@ -69,7 +70,7 @@ def main(duration: float) -> None:
     time.sleep(1.0)
     begin = time.monotonic()
     while (elapsed := time.monotonic() - begin) < duration:
-        for number, (_, _, rate, _) in enumerate(STREAMS):
+        for number, (_, _, rate, _) in enumerate(chosen):
             # Do not catch up after a pause, as a camera does not.
             if elapsed * rate >= counts[number]:
                 struct.pack_into("<iI", data[number], _STAMP, 1, counts[number])
@@ -100,4 +101,4 @@ def _example(kind: type) -> Any:
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]))
+    main(float(sys.argv[1]), images="small" not in sys.argv[2:])

@@ -34,6 +34,8 @@ class EndFitSettings:
         Standard deviation of line and end in addition to that of the maps, caused by light and
         blur: from the errors in path-traced pairs. An error that both views share is
         `FilterSettings.end_sigma`.
+    lone_widths : float
+        Standard deviation of an end without a visible shaft, in both directions.
     around_widths : float
         Half the length within which ends count as one, since a bevel blurs the end.
     hidden_end : float
@@ -45,6 +47,7 @@ class EndFitSettings:
     aside_widths: float = 2.0
     largest_slope: float = 0.15
     systematic_widths: float = 0.1
+    lone_widths: float = 0.5
     around_widths: float = 3.0
     hidden_end: float = 0.05
 
@@ -93,6 +96,7 @@ def fit_end(
     along: float,
     across: float,
     width: float,
+    lone: bool = False,
 ) -> ImageEnd | None:
     """Fit line and end.
 
@@ -108,6 +112,8 @@ def fit_end(
         Largest distance of the end from the point, along and across the direction [px].
     width : float
         Width of the needle [px].
+    lone : bool
+        Whether the map shows an end at the point, which counts even if no shaft leads to it.
 
     Returns
     -------
@@ -121,7 +127,7 @@ def fit_end(
     line = _best_line(shaft, axes, back, across, width)
     rough = _fit_line(shaft, axes, line, end=0.0, back=back, width=width)
     if rough is None:
-        return None
+        return _lone_end(shaft, ends, axes, back, width) if lone else None
     # The second fit is centred on the end that the first one leads to.
     end, _ = _end_on_line(ends, axes, rough.line, along, width)
     fitted = _fit_line(shaft, axes, rough.line, end=end, back=back, width=width)
@@ -140,6 +146,14 @@ def fit_end(
         _ends_about(ends, middle, width),
         fitted.certainty,
     )
+
+
+def _lone_end(shaft: Map, ends: Map, axes: Axes, back: float, width: float) -> ImageEnd:
+    """Return an end whose shaft is hardly visible, with the expected direction."""
+    sigma = FIT.lone_widths * width
+    certainty = float(axes.sample(shaft, -np.arange(back), np.zeros(1)).mean())
+    number = _ends_about(ends, axes.point, width)
+    return ImageEnd(axes.point, axes.direction, sigma, sigma, FIT.largest_slope, number, certainty)
 
 
 def _ends_about(ends: Map, point: Array, width: float) -> float:

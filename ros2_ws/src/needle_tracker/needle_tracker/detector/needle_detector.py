@@ -215,7 +215,7 @@ class NeedleDetector:
         )
         candidates = [window.point(peak) for peak in np.argwhere(peaks)[:, ::-1].astype(float)]
         ends = [
-            self._fitted(window, candidate, direction, width, 0.5 * width)
+            self._fitted(window, candidate, direction, width, 0.5 * width, lone=True)
             for candidate in candidates
             if math.dist(candidate, point) <= half
         ]
@@ -247,9 +247,16 @@ class NeedleDetector:
         return None if window is None else self._fitted(window, point, direction, along, across)
 
     def _fitted(
-        self, window: Window, point: Array, direction: Array, along: float, across: float
+        self,
+        window: Window,
+        point: Array,
+        direction: Array,
+        along: float,
+        across: float,
+        *,
+        lone: bool = False,
     ) -> ImageEnd | None:
-        """Fit line and end near a point of the image."""
+        """Fit line and end near a point of the image; `lone` is that of `fit_end`."""
         shrink = window.shrink
         found = fit_end(
             window.shaft,
@@ -260,6 +267,7 @@ class NeedleDetector:
             along=along / shrink,
             across=across / shrink,
             width=self.width_px / shrink,
+            lone=lone,
         )
         if found is None:
             return None

@@ -37,6 +37,8 @@ class PairingSettings:
         correlated: from 730 sightings in path-traced pairs and pairs of the quick renderer.
     least_chance : float
         Lower limit of the network's probabilities; the upper limit is 1 minus this.
+    least_evidence : float
+        Log-odds of a sighting below which it is none: it would begin a track of doubtful evidence.
     pre_bend : float
         Largest length of the pre-bend [m].
     point_sigma : float
@@ -51,6 +53,7 @@ class PairingSettings:
     sigmas: float = 3.0
     shaft_weight: float = 0.5
     least_chance: float = 0.02
+    least_evidence: float = -2.0
     pre_bend: float = 10e-3
     point_sigma: float = 0.5e-3
     passes: int = 4
@@ -157,9 +160,12 @@ class StereoSearch:
             tip = triangulate(self.views, ends, points[-1])
             if tip is None or tip.misfit > PAIRING.gate or not self.is_possible(tip, least, most):
                 continue
+            log_odds = evidence(ends, tip)
+            if log_odds < PAIRING.least_evidence:
+                continue
             before = np.linalg.norm(points, axis=1) < np.linalg.norm(tip.position)
             length = shaft_length(np.vstack([points[before], tip.position]))
-            yield Sighting(tip, ends, evidence(ends, tip), length)
+            yield Sighting(tip, ends, log_odds, length)
 
     def is_possible(self, tip: SpatialTip, least: float, most: float) -> bool:
         """Return whether position and direction of a tip are possible for the needle."""
