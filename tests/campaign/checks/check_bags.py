@@ -1,14 +1,17 @@
-"""Step E: a complete and readable bag at full rate."""
+"""Step E: complete and readable bags."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 
 from campaign.checking import Check, Finding, Workbench, at_most, bag_read_error
-from campaign.trials.recording_trials import record_full_rate
+from campaign.trials.recording_trials import record_and_kill, record_full_rate
 
 DURATION = 60.0
+MOMENTS = 25
 PROCESSOR_SHARE, MEMORY_GROWTH_MB = 0.35, 5.0
+LAST_SECONDS = 0.5
 
 
 def full_rate(bench: Workbench) -> Iterator[Finding]:
@@ -30,4 +33,21 @@ def full_rate(bench: Workbench) -> Iterator[Finding]:
     yield Finding("full_rate_readers", "rosbags and mcap", "read all", why or "read all", not why)
 
 
-CHECKS: tuple[Check, ...] = (full_rate,)
+def killed(bench: Workbench) -> Iterator[Finding]:
+    """Kill the recorder at random moments, with images and without, and recover the bag."""
+    for what, argv in (("images", ()), ("small", ("small",))):
+        folder = bench.folder / f"killed_{what}"
+        folder.mkdir()
+        whys, ages, gaps = zip(*record_and_kill(folder, MOMENTS, *argv), strict=True)
+        shutil.rmtree(folder)
+        why = [one for one in whys if one]
+        yield Finding(
+            f"killed_{what}",
+            f"kill -9 at {MOMENTS} random moments, {what}, then recover",
+            f"rosbags and mcap open all, at most the last {LAST_SECONDS:g} s missing, no gaps",
+            f"{len(why)} do not {why[:1]}, at most {max(ages):.2f} s missing, {sum(gaps)} gaps",
+            not why and max(ages) <= LAST_SECONDS and not sum(gaps),
+        )
+
+
+CHECKS: tuple[Check, ...] = (full_rate, killed)

@@ -1,4 +1,4 @@
-"""A recording of numbered messages at full rate."""
+"""Recordings of numbered messages: at full rate, and with a recorder that is killed."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import Reader
 
-from campaign.checking import busy
+from campaign.checking import bag_read_error, busy
 from needle_bags.reading.bag_messages import read_contents
 from needle_bags.recording.recording import MESSAGES_LOST
+from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import reserve_domain_id
 
 # Bytes of the stamp's nanoseconds, which are the number of the message.
 _NUMBER = slice(8, 12)
+_START_UP = 30.0
+_LOAD = "campaign.trials.recording_load"
 
 
-def record_full_rate(folder: Path, duration: float) -> dict[str, Any]:
-    """Record a rig at full rate for a duration [s], while two processes load the CPU.
+def record_full_rate(folder: Path, duration: float, others: int = 2) -> dict[str, Any]:
+    """Record a rig at full rate for a duration [s], while other processes load the CPU.
 
     Returns
     -------
@@ -37,12 +40,11 @@ def record_full_rate(folder: Path, duration: float) -> dict[str, Any]:
         in the second half [MB], the write rate `MB_per_s`, and the exit `code`.
     """
     bag = folder / "full_rate"
-    argv = ["--ros-args", "-p", f"bag:={bag}"]
     with (
         reserve_domain_id() as domain,
-        _process(domain, "needle_bags.ros.recorder", *argv) as recording,
-        busy(2),
-        _process(domain, "campaign.trials.recording_load", str(duration)) as load,
+        recorder(domain, bag) as recording,
+        busy(others),
+        _process(domain, _LOAD, str(duration)) as load,
     ):
         begin, before = time.monotonic(), _processor_time(recording.pid)
         memory: list[float] = []
@@ -71,6 +73,56 @@ def record_full_rate(folder: Path, duration: float) -> dict[str, Any]:
         "MB_per_s": size / duration / 1e6,
         "code": code,
     }
+
+
+def record_and_kill(folder: Path, moments: int, *argv: str) -> Iterator[tuple[str, float, int]]:
+    """Kill a recorder at random moments, and recover each bag.
+
+    Yields
+    ------
+    str, float, int
+        Reason if the bag cannot be read; time from its last message to the kill [s]; number of
+        messages missing between others of their topic.
+    """
+    rng = np.random.default_rng(5)
+    for number in range(moments):
+        bag = folder / f"killed_{number}"
+        # A new domain each time: shared memory of a killed process may block discovery.
+        with (
+            reserve_domain_id() as domain,
+            recorder(domain, bag) as recording,
+            _process(domain, _LOAD, "3600", *argv),
+        ):
+            deadline = time.monotonic() + _START_UP
+            # Wait for the first chunk of data on the disk.
+            while sum(file.stat().st_size for file in bag.glob("*.mcap")) < 50_000:
+                if time.monotonic() > deadline or recording.poll() is not None:
+                    raise UserError(f"the recorder does not record into {bag}")
+                time.sleep(0.01)
+            time.sleep(float(rng.uniform(0.0, 2.0)))
+            killed_at = time.time_ns()
+            recording.kill()
+            recording.wait(10.0)
+        recover_bag(bag)
+        if why := bag_read_error(bag):
+            yield why, 0.0, 0
+            continue
+        # A best-effort topic may lose messages before the discovery of the recorder.
+        gaps = sum(
+            max(found) - min(found) + 1 - len(set(found))
+            for topic, found in _numbers(bag).items()
+            if topic != "/device/hold"
+        )
+        with Reader(bag) as reader:
+            yield "", (killed_at - (reader.end_time - 1)) * 1e-9, gaps
+
+
+def recorder(
+    domain: int, bag: Path, name: str = "recorder"
+) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
+    """Start a recorder with this node name; kill it at the end."""
+    argv = ["--ros-args", "-r", f"__node:={name}", "-p", f"bag:={bag}"]
+    return _process(domain, "needle_bags.ros.recorder", *argv)
 
 
 @contextlib.contextmanager
