@@ -157,6 +157,9 @@ class StereoSearch:
         right = self._ends(1, grid, shaft, hidden=hidden) if left else []
         points = grid.points(shaft.cells)
         for ends in itertools.product(left, right):
+            # One view may hide the shaft, but not both.
+            if max(end.shaft for end in ends) < 0.5:
+                continue
             tip = triangulate(self.views, ends, points[-1])
             if tip is None or tip.misfit > PAIRING.gate or not self.is_possible(tip, least, most):
                 continue

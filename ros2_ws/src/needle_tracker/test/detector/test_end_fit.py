@@ -28,13 +28,20 @@ def maps(
 
 
 def fitted(
-    drawn: tuple[np.ndarray, np.ndarray], angle: float, across: float = 4.0
+    drawn: tuple[np.ndarray, np.ndarray], angle: float, across: float = 4.0, *, lone: bool = False
 ) -> ImageEnd | None:
     """Fit from a position that is 3 px off and a direction that is 0.03 rad off."""
     direction = np.array([math.cos(angle + 0.03), math.sin(angle + 0.03)])
     place = END + np.array([3.0, 0.0])
     return fit_end(
-        *drawn, place, direction, shaft_length=60.0, along=15.0, across=across, width=WIDTH
+        *drawn,
+        place,
+        direction,
+        shaft_length=60.0,
+        along=15.0,
+        across=across,
+        width=WIDTH,
+        lone=lone,
     )
 
 
@@ -76,6 +83,12 @@ def test_a_needle_away_from_the_expected_place_is_found_within_the_search() -> N
     np.testing.assert_allclose(end.point, beside, atol=0.2)
 
 
-def test_a_map_without_shaft_has_no_end() -> None:
+def test_without_a_shaft_only_an_end_that_the_map_shows_counts() -> None:
     shaft, ends = maps(0.0, 0.8)
     assert fitted((0.0 * shaft, ends), 0.0) is None
+    end = fitted((0.0 * shaft, ends), 0.0, lone=True)
+    assert end is not None
+    assert end.ends > 0.9
+    assert end.shaft == 0.0
+    np.testing.assert_allclose(end.direction, [math.cos(0.03), math.sin(0.03)])
+    assert end.sigma_across == end.sigma_along == pytest.approx(0.5 * WIDTH)

@@ -33,6 +33,7 @@ class DrawnLines:
     lines: list[np.ndarray]
     are_thin: bool = False
     ends: float = 0.95
+    shaft: float = 0.9
     scales: int = 2
 
     def scores(
@@ -57,7 +58,7 @@ class DrawnLines:
             near, end = self.view.project(line[-10:])[[0, -1]]
             if math.dist(end, point) < 15.0:
                 along = (end - near) / math.dist(end, near)
-                found.append(ImageEnd(end, along, 0.2, 1.0, 0.01, self.ends, 0.9))
+                found.append(ImageEnd(end, along, 0.2, 1.0, 0.01, self.ends, self.shaft))
         return found
 
 
@@ -67,9 +68,16 @@ def search(views: Views) -> Search:
     make_search_grid(views, settings)
 
     def make(
-        left: list[np.ndarray], right: list[np.ndarray], *, are_thin: bool = False
+        left: list[np.ndarray],
+        right: list[np.ndarray],
+        *,
+        are_thin: bool = False,
+        shafts: tuple[float, float] = (0.9, 0.9),
     ) -> StereoSearch:
-        detectors = DrawnLines(views[0], left, are_thin), DrawnLines(views[1], right, are_thin)
+        detectors = tuple(
+            DrawnLines(view, lines, are_thin, shaft=shaft)
+            for view, lines, shaft in zip(views, (left, right), shafts, strict=True)
+        )
         return StereoSearch(views, detectors, settings)  # type: ignore[arg-type]
 
     return make
@@ -98,6 +106,12 @@ def test_one_needle_in_both_views_is_one_sighting(
     np.testing.assert_allclose(sighting.tip.position, needle[-1], atol=0.05e-3)
     assert sighting.length == pytest.approx(0.06, abs=0.6e-3)
     assert sighting.evidence > 4.0
+
+
+def test_one_view_may_hide_the_shaft_but_not_both(search: Search, needle: np.ndarray) -> None:
+    for shafts, count in (((0.3, 0.9), 1), ((0.3, 0.3), 0)):
+        found = search([needle], [needle], shafts=shafts).search(3e-3, 0.15)[0]
+        assert len(found) == count
 
 
 def test_a_line_in_only_one_view_is_no_sighting(search: Search, needle: np.ndarray) -> None:
