@@ -142,6 +142,7 @@ def test_objects_are_those_that_canopen_reads(tmp_path: Path) -> None:
     sections["DeviceInfo"]["ProductName"] = "Müller 5/7"
     sections["1800sub1"] |= {"DefaultValue": "$NODEID+0x180", "ParameterValue": "0x190"}
     sections["60C2sub2"] |= {"AccessType": "rww", "LowLimit": "0x80", "HighLimit": "63"}
+    sections["6064"] |= {"LowLimit": "0xFFFFFF38", "HighLimit": "0xC8"}
     sections["1003"] = {"ParameterName": "Errors", "ObjectType": "0x8", "CompactSubObj": "3"}
     sections["1003"] |= {"DataType": "0x6", "AccessType": "ro", "DefaultValue": "7"}
     file = write(sections, tmp_path / "drive.dcf")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from needle_core.errors import OutOfBoundsError
+from needle_core.errors import OutOfBoundsError, UserError
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import SafetyLimits
@@ -36,7 +36,7 @@ LIMITS = {
 }
 
 
-def test_limits_have_these_defaults_and_caps() -> None:
+def test_limits_are_positive_and_have_these_defaults_and_caps() -> None:
     defaults = {name: default for name, (default, _) in LIMITS.items()}
     assert dataclasses.asdict(SafetyLimits.of(DeviceDriverParameters())) == defaults
     # Ideal axes have smaller tolerances.
@@ -46,6 +46,9 @@ def test_limits_have_these_defaults_and_caps() -> None:
         assert getattr(SafetyLimits(**{name: cap}), name) == cap
         with pytest.raises(OutOfBoundsError, match=name):
             SafetyLimits(**{name: cap * 1.001})
+        for bad in (0.0, -1.0, math.nan):
+            with pytest.raises(UserError, match=name):
+                SafetyLimits(**{name: bad})
         changed: dict[str, Any] = {name: 0.9 * default}
         given = SafetyLimits.of(DeviceDriverParameters(**changed))
         assert dataclasses.asdict(given) == defaults | changed
