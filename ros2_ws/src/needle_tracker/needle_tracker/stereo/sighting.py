@@ -38,7 +38,8 @@ class PairingSettings:
     least_chance : float
         Lower limit of the network's probabilities; the upper limit is 1 minus this.
     least_evidence : float
-        Log-odds of a sighting below which it is none: it would begin a track of doubtful evidence.
+        Log-odds of a sighting below which it is none. In 105 new path-traced scenes this loses few
+        needles, while tracks that begin with less keep a poor mean evidence.
     pre_bend : float
         Largest length of the pre-bend [m].
     point_sigma : float
