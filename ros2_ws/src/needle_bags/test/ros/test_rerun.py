@@ -12,22 +12,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from rclpy.parameter import Parameter
 
-from made_up_run import copy_messages, header, message, serialized
+from made_up_run import STORE, copy_messages, header, message, serialized
 from needle_bags.format.bag_writer import BagCopy, standard_topic, string_message
+from needle_bags.link import openigtlink
 from needle_bags.live import live_view
 from needle_bags.reading.bag_messages import raw_as_sent, read_contents, read_messages
 from needle_bags.reading.bag_reader import read_run
-from needle_bags.rerun.rerun_bag import TABLE
+from needle_bags.rerun.rerun_bag import TABLE, write_rerun
+from needle_bags.rerun.stages import Output
 from needle_bags.ros import rerun as rerun_node
 from needle_core.errors import UserError
 from needle_core.files.bag_topic import BagTopic
 from needle_tracker.optics.calibration import StereoCalibration, parse_calibration
 
 PICTURES = live_view.PICTURES.values()
-RCL = "rcl_interfaces/msg"
+EVENT, TEXT = "rcl_interfaces/msg/ParameterEvent", "std_msgs/msg/String"
+
 Capture = pytest.CaptureFixture[str]
+
+Shown = tuple[Path, Path, str]
 
 
 def rerun(*arguments: object) -> int:
@@ -54,6 +60,27 @@ def given(folder: Path, text: str, node: str = "plane_controller") -> Path:
 
 
 @pytest.fixture(scope="module")
+def untouched(regression: Path) -> tuple[int, str]:
+    """Rerun the whole committed bag."""
+    return printed(regression)
+
+
+@pytest.fixture(scope="module")
+def mirrored(first_pictures: Path) -> tuple[int, str]:
+    """Rerun the bag up to its first pictures by code with an inverted sign."""
+
+    def mirror(document: Any) -> StereoCalibration:
+        calibration = parse_calibration(document)
+        matrix = calibration.left.camera_matrix * np.array([[1, 1, 1], [1, -1, 1], [1, 1, 1]])
+        left = dataclasses.replace(calibration.left, camera_matrix=matrix)
+        return dataclasses.replace(calibration, left=left)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rerun_node, "parse_calibration", mirror)
+        return printed(first_pictures)
+
+
+@pytest.fixture(scope="module")
 def paper_bag(tmp_path_factory: pytest.TempPathFactory, eight_steps: Path) -> Path:
     """The first steps, as preset paper would command them."""
     bag = tmp_path_factory.mktemp("rerun") / "paper"
@@ -61,8 +88,10 @@ def paper_bag(tmp_path_factory: pytest.TempPathFactory, eight_steps: Path) -> Pa
     return bag
 
 
-def test_unchanged_code_gives_unchanged_outputs(regression: Path) -> None:
-    code, output = printed(regression)
+def test_unchanged_code_gives_unchanged_outputs(
+    untouched: tuple[int, str], regression: Path
+) -> None:
+    code, output = untouched
     assert code == 0, f"{output}\nmeant? scripts/renew_regression_bag"
     assert "6 image pairs through stereo_tracker, 121 tips through plane_controller" in output
     assert "UNCHANGED" in output
@@ -71,17 +100,8 @@ def test_unchanged_code_gives_unchanged_outputs(regression: Path) -> None:
     assert len(rows) == read_contents(regression).counts["/needle/estimate"]
 
 
-def test_a_wrong_sign_in_the_projection_is_detected(
-    first_pictures: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def mirror(document: Any) -> StereoCalibration:
-        calibration = parse_calibration(document)
-        matrix = calibration.left.camera_matrix * np.array([[1, 1, 1], [1, -1, 1], [1, 1, 1]])
-        left = dataclasses.replace(calibration.left, camera_matrix=matrix)
-        return dataclasses.replace(calibration, left=left)
-
-    monkeypatch.setattr(rerun_node, "parse_calibration", mirror)
-    code, output = printed(first_pictures)
+def test_a_wrong_sign_in_the_projection_is_detected(mirrored: tuple[int, str]) -> None:
+    code, output = mirrored
     assert code == 1
     assert "needle/tip: 1 recorded only (at 30.0 mm" in output
 
@@ -121,18 +141,38 @@ def test_another_preset_gives_a_separate_run(eight_steps: Path, paper_bag: Path)
     assert lines[0].split()[:3] == ["insertion_mm", "tip_x_mm", "tip_y_mm"]
 
 
-def test_viewers_show_the_recorded_needle_without_comparison(
-    first_pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    bag, again = tmp_path / "shown", tmp_path / "again"
-    code, output = printed(first_pictures, "--viewers", "--output", bag)
+def test_tips_without_images_are_kept(eight_steps: Path, tmp_path: Path) -> None:
+    run, topic = read_run(eight_steps), "/needle/tip"
+    tips = [message for _, _, message in read_messages(eight_steps, topic.__eq__)]
+    tips[3].point.x = 0.5
+    output = Output("needle/tip", run.tips.received[3], int(run.tips.stamps[3]), tips[3])
+    write_rerun(run, tmp_path / "bag", [output], {}, "")
+    assert read_contents(tmp_path / "bag").counts == read_contents(eight_steps).counts
+    after = read_run(tmp_path / "bag").tips.values
+    assert np.flatnonzero((after != run.tips.values).any(axis=1)).tolist() == [3]
+
+
+@pytest.fixture(scope="module")
+def shown(first_pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Rerun the bag up to its first pictures for viewers, with pyigtl; return bag and output."""
+    bag = tmp_path_factory.mktemp("rerun") / "shown"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("importlib.util.find_spec", lambda _: True)
+        patch.setattr(openigtlink, "packed", lambda *_: b"needle")
+        code, output = printed(first_pictures, "--viewers", "--output", bag)
     assert code == 0, output
-    assert "openigtlink: left out, pyigtl is not installed" in output
+    return bag, output
+
+
+def test_viewers_show_the_recorded_needle_without_comparison(
+    shown: tuple[Path, str], first_pictures: Path
+) -> None:
+    bag, output = shown
     before, after = read_contents(first_pictures).counts, read_contents(bag).counts
     new = {topic.removeprefix("/"): n for topic, n in (after - before).items()}
     assert new.keys() == {live_view.TIP, live_view.PATH, live_view.MARKERS, *PICTURES}
     (view,) = [line for line in output.splitlines() if line.startswith("live_view: ")]
+    assert "nothing to compare, because its update times are not recorded; sent " in view
     for topic, count in new.items():
         assert f"{count} {topic}" in view
     run = read_run(first_pictures)
@@ -143,9 +183,29 @@ def test_viewers_show_the_recorded_needle_without_comparison(
     *_, (_, _, path) = read_messages(bag, f"/{live_view.PATH}".__eq__)
     tip = path.poses[-1].pose.position
     assert (tip.x, tip.y, tip.z) == tuple(run.tips.values[-1])
-    # Recorded topics of viewers are replaced.
-    assert rerun(bag, "--viewers", "--output", again) == 0
-    assert read_contents(again).counts == after
+    (link,) = [line for line in output.splitlines() if line.startswith("openigtlink: ")]
+    assert "nothing to compare, because ports are not recorded; sent " in link
+    assert int(link.split()[-2]) == pytest.approx(10 * seconds, abs=3)
+
+
+@pytest.fixture(scope="module")
+def shown_again(shown: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    """Return the rerun of a bag that already contains the viewers' topics."""
+    folder = tmp_path_factory.mktemp("again")
+    bag, file = folder / "bag", folder / "result.json"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("importlib.util.find_spec", lambda _: None)
+        code, output = printed(shown[0], "--viewers", "--output", bag, "--json", file)
+    assert code == 0
+    return bag, file, output
+
+
+def test_recorded_viewer_topics_are_replaced(shown: tuple[Path, str], shown_again: Shown) -> None:
+    bag, file, output = shown_again
+    counts = read_contents(shown[0]).counts
+    assert json.loads(file.read_text())["live_view_path_sent"] == counts["/live_view/path"]
+    assert read_contents(bag).counts == counts
+    assert "openigtlink: left out, pyigtl is not installed" in output
 
 
 def copied(bag: Path, target: Path, custom: dict[str, str], topic: BagTopic, first: bytes) -> None:
@@ -156,27 +216,31 @@ def copied(bag: Path, target: Path, custom: dict[str, str], topic: BagTopic, fir
     copy.close()
 
 
-def parameter_value(content: Any) -> Any:
-    made = Parameter("", value=content).get_parameter_value()
-    fields = {name: getattr(made, name) for name in made.get_fields_and_field_types()}
-    for kind, dtype in ("byte", "u1"), ("bool", "?"), ("integer", "i8"), ("double", "f8"):
-        # rclpy has lists; rosbags requires arrays.
-        fields[f"{kind}_array_value"] = np.array(fields[f"{kind}_array_value"], dtype)
-    return message(f"{RCL}/ParameterValue", **fields)
-
-
 def test_announced_parameters_are_sufficient(eight_steps: Path, tmp_path: Path) -> None:
     """A bag of ROS 2's own recorder has no custom data, but /parameter_events."""
     node = "/plane_controller"
-    parameters = read_run(eight_steps).parameters[node].items()
-    new = [message(f"{RCL}/Parameter", name=n, value=parameter_value(v)) for n, v in parameters]
-    changes: dict[str, Any] = {"changed_parameters": [], "deleted_parameters": []}
-    announced = message(
-        f"{RCL}/ParameterEvent", stamp=header(0).stamp, node=node, new_parameters=new, **changes
-    )
-    topic = standard_topic("/parameter_events", f"{RCL}/ParameterEvent")
+    announced = event(node, read_run(eight_steps).parameters[node])
+    topic = standard_topic("/parameter_events", EVENT)
     copied(eight_steps, tmp_path / "bag", {}, topic, serialized(announced))
     assert rerun(tmp_path / "bag") == 0
+
+
+def event(node: str, parameters: dict[str, Any]) -> Any:
+    """Return the ParameterEvent of a node at its start."""
+    kinds = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np.float64}
+
+    def value(content: Any) -> Any:
+        made = Parameter("", value=content).get_parameter_value()
+        fields = {name: getattr(made, name) for name in made.get_fields_and_field_types()}
+        for kind, numbers in kinds.items():
+            # rclpy has lists; rosbags requires arrays.
+            name = f"{kind}_array_value"
+            fields[name] = np.array(fields[name], numbers)
+        return message("rcl_interfaces/msg/ParameterValue", **fields)
+
+    parameter = STORE.types["rcl_interfaces/msg/Parameter"]
+    new = [parameter(name, value(content)) for name, content in parameters.items()]
+    return STORE.types[EVENT](header(10**9).stamp, node, new, [], [])
 
 
 def test_the_calibration_is_that_of_the_tracker_or_of_params(
@@ -184,12 +248,14 @@ def test_the_calibration_is_that_of_the_tracker_or_of_params(
 ) -> None:
     """The tracker publishes it on its own topic, so the recorder needs no setting."""
     text = read_run(eight_steps).calibration
-    topic = standard_topic("/stereo_tracker/calibration", "std_msgs/msg/String")
-    bag = tmp_path / "bag"
+    bag, topic = tmp_path / "bag", standard_topic("/stereo_tracker/calibration", TEXT)
     copied(eight_steps, bag, {"calibration": "left: {}"}, topic, string_message(text))
-    assert read_run(bag).calibration == text
+    run = read_run(bag)
+    assert run.calibration == text
     other = tmp_path / "other.yaml"
-    other.write_text(f"# another file\n{text}")
+    changed = yaml.safe_load(text)
+    changed["phantom"]["refractive_index"] += 0.01
+    other.write_text(yaml.safe_dump(changed))
     file = given(tmp_path, f"calibration_file: {other}", "stereo_tracker")
     used_texts: list[str] = []
 
@@ -204,20 +270,26 @@ def test_the_calibration_is_that_of_the_tracker_or_of_params(
     assert used_texts == [text, other.read_text()]
 
 
-def test_the_cause_of_bad_input_is_named(
+def test_bad_input_gives_a_one_line_error(
     eight_steps: Path, make_run: Callable[..., Path], tmp_path: Path, capsys: Capture
 ) -> None:
     table: dict[tuple[object, ...], str] = {
         (eight_steps, "--preset", "bset"): "--preset 'bset' is not one of",
+        (eight_steps, "--json", "/nowhere/at/all.json"): "its folder must exist",
+        (eight_steps, "--params", "/nowhere.yaml"): "/nowhere.yaml",
         (eight_steps, "--output", eight_steps): "already contains a bag",
+        (eight_steps, "--presets", "best"): "see --help",
         (make_run(steps=3),): "give them with --params",
     }
     for arguments, words in table.items():
         assert rerun(*arguments) == 2
-        assert words in capsys.readouterr().err
+        error = capsys.readouterr().err
+        assert words in error
+        assert error.count("\n") == 1
     for text, words in (
         ("curvatur: 8.0", "has no parameter curvatur"),
         ("curvature: -8.0", "curvature = -8"),
+        ("curvature: high", "curvature"),
     ):
         assert rerun(eight_steps, "--params", given(tmp_path, text)) == 2
         # It first warns of parameters in the bag that today's nodes lack.

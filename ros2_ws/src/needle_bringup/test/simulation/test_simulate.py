@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -24,6 +24,10 @@ from needle_core.status_messages import ControllerStatus
 
 pytestmark = pytest.mark.usefixtures("compiled")
 WORDS = ("--level", "tip", "--depth-mm", "4", "--initial", "0.2,0,0")
+KEYS = {
+    *("level", "controller", "seed", "steps", "converged", "r1_final_mm", "r1_rms_last_20_mm"),
+    *("tip_error_p95_mm", "depth_error_p95_mm", "steps_per_s", "wall_s", "watchdog_trips", "bag"),
+}
 
 
 def record(folder: Path, *argv: str, check: Callable[[], None] = lambda: None) -> bytes:
@@ -38,13 +42,21 @@ def record(folder: Path, *argv: str, check: Callable[[], None] = lambda: None) -
     return file.read_bytes()
 
 
-def test_a_run_leaves_bag_report_and_summary(tmp_path: Path) -> None:
-    folder = tmp_path
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, Path]:
+    """Return the exit code of a whole run, and its folder."""
+    folder = tmp_path_factory.mktemp("ended")
     argv = [*WORDS, "--bag", str(folder / "bag"), "--json", str(folder / "result.json")]
-    code = simulate.main(argv)
+    return simulate.main(argv), folder
+
+
+def test_a_run_leaves_bag_report_and_summary(ended: tuple[int, Path]) -> None:
+    code, folder = ended
     summary = json.loads((folder / "bag" / "summary.json").read_text("utf-8"))
     assert (folder / "result.json").read_text() == (folder / "bag" / "summary.json").read_text()
+    assert set(summary) >= KEYS
     assert (code, summary["converged"], summary["steps"]) == (0, True, 4)
+    assert abs(summary["r1_final_mm"]) < 1.0
     for name in ("report.html", "parameters.yaml", "metadata.yaml"):
         assert (folder / "bag" / name).is_file()
     lines = simulate.describe(summary, folder / "bag").splitlines()
@@ -54,18 +66,24 @@ def test_a_run_leaves_bag_report_and_summary(tmp_path: Path) -> None:
     assert "tripped 3 times" in simulate.describe({**summary, "watchdog_trips": 3}, folder)
 
 
-@pytest.mark.parametrize(
-    "argv",
-    [WORDS, (*WORDS, "--insertion", "continuous"), ("--level", "drive", "--depth-mm", "1")],
-)
-def test_equal_seeds_give_equal_runs(tmp_path: Path, argv: tuple[str, ...]) -> None:
-    one, again, other = (
-        record(tmp_path / name, *argv, "--seed", seed)
-        for name, seed in (("one", "1"), ("again", "1"), ("other", "2"))
-    )
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
+    """Return for each kind of run the bags of a seed, of the same seed again, and of another."""
+    folder, drive = tmp_path_factory.mktemp("recorded"), ("--level", "drive", "--depth-mm", "1")
+    kinds = {"tip": WORDS, "drive": drive, "continuous": (*WORDS, "--insertion", "continuous")}
+    runs = {}
+    for kind, argv in kinds.items():
+        seeds = enumerate(("1", "1", "2"))
+        runs[kind] = [record(folder / f"{kind}_{n}", *argv, "--seed", s) for n, s in seeds]
+        assert rerun.main([str(folder / f"{kind}_0")]) == 0
+    return runs
+
+
+@pytest.mark.parametrize("kind", ["tip", "drive", "continuous"])
+def test_equal_seeds_give_equal_runs(recorded: Mapping[str, list[bytes]], kind: str) -> None:
+    one, again, other = recorded[kind]
     assert again == one
     assert other != one
-    assert rerun.main([str(tmp_path / "one")]) == 0
 
 
 def test_an_invalid_run_leaves_nothing(tmp_path: Path) -> None:
