@@ -22,7 +22,7 @@ from scenario.parts.rogue_publisher import RoguePublisher
 from scenario.rig import SECOND_JOYSTICK, SECOND_OPERATOR, SoakRig
 from scenario.schedule_runner import Undo
 
-_LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS)
+_LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
 SLOWEST_HANDLER = 0.05
 """Largest added time of a handler of a slow node [s]."""
 LATEST_MESSAGE = 1.0
@@ -62,10 +62,14 @@ class FaultInjector:
         self._timeline = rig.runner.timeline
         self._rogues = itertools.count(1)
         self._injectors: dict[str, Callable[[Fault], Undo]] = {
-            **dict.fromkeys(faults.PROCESSES, self._inject_process_fault),
+            **dict.fromkeys(
+                (*faults.PROCESSES, faults.CONSOLE, faults.RECORDER), self._inject_process_fault
+            ),
+            faults.DISK: self._inject_disk_fault,
             **dict.fromkeys(_LINKS, self._inject_link_fault),
             **dict.fromkeys(faults.DRIVES, self._inject_drive_fault),
             faults.ADAPTER: self._unplug,
+            faults.PAGE: self._inject_page_fault,
             faults.CAMERAS: self._inject_camera_fault,
             faults.CLOCK: self._inject_clock_fault,
             faults.PERSON: self._inject_operator_error,
@@ -83,11 +87,17 @@ class FaultInjector:
     # ---- parts ----------------------------------------------------------------------------------
 
     def _inject_process_fault(self, fault: Fault) -> Undo:
-        rig, name = self._rig, fault.part
+        rig, names = self._rig, self._rig.processes_of(fault.part)
         if fault.kind is Kind.OFF:
-            rig.kill(name)
-            return partial(rig.start, name)
-        if rig.runner.runs(name):
+            for name in names:
+                rig.kill(name)
+
+            def start() -> None:
+                for name in names:
+                    rig.start(name)
+
+            return start
+        for name in filter(rig.runner.runs, names):
             if fault.kind is Kind.STUCK:
                 rig.runner.freeze(name, fault.lasts)
             else:
@@ -97,6 +107,18 @@ class FaultInjector:
     def _unplug(self, _: Fault) -> Undo:
         self._rig.unplug()
         return self._rig.plug_in
+
+    def _inject_page_fault(self, fault: Fault) -> Undo:
+        rig = self._rig
+        if fault.kind is Kind.OFF:
+            if rig.runner.runs(faults.PAGE):
+                rig.runner.stop(faults.PAGE)
+            return partial(rig.start, faults.PAGE)
+        if fault.kind is Kind.STUCK:
+            return self._inject_process_fault(fault)
+        doing = "sends_garbage" if fault.kind is Kind.GARBAGE else "repeats"
+        setattr(rig.page, doing, True)
+        return lambda: setattr(rig.page, doing, False)
 
     def _inject_link_fault(self, fault: Fault) -> Undo:
         late = fault.size * (_LATEST_FRAME if fault.part == faults.BUS else LATEST_MESSAGE)
@@ -170,6 +192,10 @@ class FaultInjector:
             person.absent = hand.stop = False
 
         return end
+
+    def _inject_disk_fault(self, fault: Fault) -> Undo:
+        assert self._rig.disk is not None, "the rig has no recorder"
+        return self._rig.disk.spoil(fault)
 
     def _inject_second_operator(self, fault: Fault) -> Undo:
         rig, hand, chance = self._rig, self._rig.second_hand, self._chance_of(fault)

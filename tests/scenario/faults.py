@@ -57,6 +57,10 @@ PERSON, PARAMETERS = "person", "parameters"
 SECOND_PERSON = "second person"
 """Person with a separate joystick and operator node: keeps it pressed, retracts, presses at random,
 loses the joystick during a press."""
+CONSOLE, PAGE, PAGE_LINE = "console", "page", "page line"
+"""With a fault of one of these, the operator holds by a page of the console, not the joystick."""
+RECORDER, DISK = "recorder", "disk"
+"""With a fault of one of these, the rig has a recorder with a disk."""
 DRIVES = ("insertion drive", "rotation drive")
 ROGUE = "stranger on "
 """Prefix of parts on which a foreign node publishes, or that it calls."""
@@ -84,7 +88,12 @@ _DRAWN_TOGETHER: dict[str, tuple[Kind, ...]] = {
 }
 _DRAWN_ALONE: dict[str, tuple[Kind, ...]] = {
     SECOND_PERSON: (Kind.STUCK, Kind.WRONG, Kind.INTERMITTENT, Kind.OFF),
+    CONSOLE: (Kind.OFF, Kind.STUCK, Kind.SLOW),
+    PAGE: (Kind.OFF, Kind.STUCK, Kind.GARBAGE, Kind.DUPLICATED),
+    PAGE_LINE: (Kind.OFF, Kind.SLOW, Kind.INTERMITTENT),
     FLOOD: (Kind.WRONG, Kind.GARBAGE),
+    RECORDER: (Kind.OFF, Kind.STUCK, Kind.SLOW),
+    DISK: (Kind.OFF, Kind.STUCK, Kind.GARBAGE, Kind.SLOW),
 }
 VOCABULARY = {**_DRAWN_TOGETHER, **_DRAWN_ALONE}
 """Kinds of faults by part."""

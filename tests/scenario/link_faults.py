@@ -8,11 +8,16 @@ from typing import Any
 
 from needle_core.can_frame import CAN
 from needle_core.runners.transport import Arrival, Arrivals, Link
-from scenario.faults import BUS, TOPICS
+from scenario.faults import BUS, PAGE_LINE, TOPICS
 
-# Delay of a retransmission of a reliable topic [s].
-_RESEND = (0.02, 0.1)
+# Delay of a retransmission [s]: reliable topic, TCP.
+_RESEND, _RESEND_TCP = (0.02, 0.1), (0.2, 0.4)
 _BEST_EFFORT = ("/joy", "/device/hold")
+_PARTS = {CAN: BUS, PAGE_LINE: PAGE_LINE}
+_RESENT = {
+    **{topic: _RESEND for topic in TOPICS if topic not in _BEST_EFFORT},
+    PAGE_LINE: _RESEND_TCP,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +48,8 @@ class LinkFault:
 class LinkFaults:
     """Active faults by link; called by the virtual runner for each message.
 
-    Reliable topics retransmit lost messages, which arrive late and in order. On the bus, faults
-    apply to each frame of a batch.
+    Reliable topics and TCP retransmit lost messages, which arrive late and in order. On the bus,
+    faults apply to each frame of a batch.
     """
 
     def __init__(self) -> None:
@@ -62,11 +67,11 @@ class LinkFaults:
         """Return the arrivals of a message that is sent now; None without a fault."""
         if not self._on:
             return None
-        part = BUS if link.topic == CAN else f"/{link.topic}"
+        part = _PARTS.get(link.topic, f"/{link.topic}")
         fault = self._on.get(part)
         if fault is None:
             return None
-        resend = _RESEND if part in TOPICS and part not in _BEST_EFFORT else None
+        resend = _RESENT.get(part)
         whole = [(frame,) for frame in message] if part == BUS else [message]
         return [arrival for one in whole for arrival in _arrivals(fault, one, now, rng, resend)]
 

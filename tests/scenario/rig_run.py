@@ -15,7 +15,7 @@ from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor, Violat
 from scenario.monitors.limit_monitor import SetPointFrames
 from scenario.parts.bench import Motors
 from scenario.parts.operator_model import OUT, OperatorGoal
-from scenario.rig import OPERATOR, SECOND, SoakRig
+from scenario.rig import SECOND, SoakRig
 from scenario.schedule_runner import ScheduleRunner, relative_to_moments, watch_moments
 
 # Longest wait for moments that faults follow [s].
@@ -30,6 +30,8 @@ UNDISTURBED_DEPTH, _CONVERGED = 0.08, 0.001
 _HOLD, _JOINTS = "/device/hold", "/joint_states"
 # Topics between a press and the driver.
 _HOLD_LINKS = ("/joy", _HOLD)
+# With a fault of one of these, the operator holds by a page.
+_AT_PAGE = (of.CONSOLE, of.PAGE, of.PAGE_LINE)
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
 # Parts whose faults keep joint states from the controller.
 _JOINT_STATE_SOURCES = (_JOINTS, "device_driver", "plane_controller")
@@ -88,11 +90,15 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     faults : sequence of Fault
         Faults of the run.
     """
-    rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH)
+    at_page = any(fault.part in _AT_PAGE for fault in faults)
+    rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH, at_page=at_page)
     if any(fault.part == of.SECOND_PERSON for fault in faults):
         # Their joystick must report neutral once before it counts.
         for name in SECOND:
             rig.start(name)
+    of_recording = [fault for fault in faults if fault.part in (of.RECORDER, of.DISK)]
+    if of_recording:
+        rig.record()
     watch = _watched(rig, faults)
     schedule = ScheduleRunner(rig.runner.timeline, faults, FaultInjector(rig).begin)
     watch_moments(rig, schedule.reach)
@@ -109,6 +115,9 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         rig.run(_POLL_PERIOD)
     if not _has_left(rig):
         watch.violate("run_can_continue", rig.now, _state_of(rig))
+    losses = rig.losses(check_killed=len(of_recording) == 1)
+    if losses:
+        watch.violate("nothing_recorded_is_lost", rig.now, "; ".join(losses))
     for error in rig.crashes:
         watch.violate("no_node_crashes", rig.now, error)
     if not faults and not (rig.person.done and abs(rig.bench.deepest_tip[0]) <= _CONVERGED):
@@ -128,6 +137,8 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
         for fault in faults
         if fault.part in _HOLD_LINKS and fault.kind in _LATE
     )
+    # A page may be silent for 0.25 s, a joystick for 0.1 s.
+    late += 0.15 if rig.hand_node == of.CONSOLE else 0.0
     slow = (f.size for f in faults if f.part == "device_driver" and f.kind is Kind.SLOW)
     slowness = max(slow, default=0.0) * SLOWEST_HANDLER
     watch = InvariantMonitor(SafetyLimits(), RELEASE_BOUND + late, slowness)
@@ -136,9 +147,11 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
 
     def observe_motors(now: float, at: Motors) -> None:
         rig.digest.update(_rounded((at.insertion, at.rotation)))
-        watch.observe_hand(now, holds=rig.hand.holds)
+        watch.observe_hand(now, holds=rig.hand_presses)
         watch.observe_driver(now, responsive=rig.runner.is_responsive("device_driver"))
         watch.observe_motors(now, at.insertion, at.rotation)
+        if rig.recorders:
+            watch.observe_waiting(now, rig.recorders[-1].recording.bytes_waiting)
 
     def observe_command(_: str, message: m.Trajectory) -> None:
         for point in message.points:
@@ -146,8 +159,12 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
         watch.observe_command([(at.positions[0], at.positions[1]) for at in message.points])
 
     def observe_hold(node: str, message: m.HoldState) -> None:
+        if node == of.CONSOLE:
+            # The hand may have been pressed since the last tick.
+            watch.observe_hand(rig.now, holds=rig.hand_presses)
+            watch.observe_page_hold(rig.now, pressed=message.pressed)
         if message.pressed:
-            (watch.observe_hold if node == OPERATOR else watch.observe_other_hold)(rig.now)
+            (watch.observe_hold if node == rig.hand_node else watch.observe_other_hold)(rig.now)
 
     def receive(message: m.HoldState, now: float) -> None:
         pressed = message.pressed and 0.0 <= message.speed_scale <= 1.0

@@ -10,7 +10,7 @@ from typing import Any
 
 from needle_core.runners.timeline import Timeline
 from scenario.faults import Fault, Moment
-from scenario.rig import OPERATOR, SoakRig
+from scenario.rig import SoakRig
 
 Undo = Callable[[], None]
 # Moment at which a field of a status gets a value.
@@ -121,7 +121,7 @@ def watch_moments(rig: SoakRig, reach: Callable[[Moment], None]) -> None:
         rig.watch(topic, watch)
 
     def observe_hold(node: str, message: Any) -> None:
-        if node != OPERATOR:
+        if node != rig.hand_node:
             return
         pressed = last.get(node, False)
         last[node] = message.pressed

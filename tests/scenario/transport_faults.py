@@ -17,3 +17,10 @@ def delay(topic: str, seconds: float) -> Fault:
     return lambda link, message, now, rng: (
         (Arrival(seconds, message),) if link.topic == topic else None
     )
+
+
+def duplicate(topic: str, seconds: float) -> Fault:
+    """Return a fault that delivers each message of a topic again after some time."""
+    return lambda link, message, now, rng: (
+        (Arrival(0.0, message), Arrival(seconds, message, True)) if link.topic == topic else None
+    )

@@ -20,6 +20,7 @@ from needle_device_driver.rules import Rule
 
 HOLD = Output("device/hold", m.HoldState, BEST_EFFORT)
 COMMANDS = Output("device/joint_trajectory", m.Trajectory)
+ESTOP = Output("device/estop", m.EmergencyStop)
 STATUS = Output("device/status", DeviceStatus, LATCHED)
 
 

@@ -1,1 +1,1 @@
-"""Monitors of a run from outside: invariants, limits and holds."""
+"""Monitors of a run from outside: invariants, limits, holds and recordings."""

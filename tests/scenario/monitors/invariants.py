@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_device_driver.supervisor.limits import SafetyLimits
+from scenario.monitors.bag_monitor import WAITING_LIMIT
 from scenario.monitors.hold_monitor import HoldMonitor
 from scenario.monitors.limit_monitor import LimitMonitor
 
@@ -25,6 +26,9 @@ WATCHDOG_BOUND = 0.2
 # Discovery time of a new publisher [s], whose press counts from then (docs/safety.md,
 # hold_new_press).
 DISCOVERED_WITHIN = 0.2
+# Longest time after which a page's hold may still be published once the finger is lifted [s]: an
+# echo counts for 0.25 s (docs/safety.md, hold's end), and the hand is sampled every 0.005 s.
+PAGE_LIFETIME = 0.26
 # Largest lag of a status behind the motors [s].
 _STATUS_LAG = 0.15
 # The controller learns of a motion with its next tip: two steps [m].
@@ -35,6 +39,8 @@ _COMMANDS = 50
 # Tolerated insertion beyond the command [m], and rotation out of proportion [rad]: a rotation drive
 # may fall silent at 3 rad/s, and insertion continues until that is detected.
 _BEYOND_COMMAND, _OUT_OF_PROPORTION = 0.0006, 0.5
+# Small messages have an eighth more room, and the last one may exceed it [B].
+_WAITING = WAITING_LIMIT + WAITING_LIMIT // 8 + 70_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,6 +93,8 @@ class InvariantMonitor:
         self._pressed_until = self._reported_until = self._other_until = -1.0
         self._pressed_since = self._other_since = -1.0
         self._holds = False
+        self._page_holds = False
+        self._page_ended = -1.0
         self._must_press_after = 0.0
         self._status = DeviceStatus()
         self._status_at = 0.0
@@ -117,6 +125,21 @@ class InvariantMonitor:
     def observe_hold(self, at: float) -> None:
         """Observe a message by which the hand's own node reports a press."""
         self._reported_until = at
+
+    def observe_page_hold(self, at: float, *, pressed: bool) -> None:
+        """Observe whether the console reports a press of the hand at its page."""
+        idle = at - self._pressed_until
+        if pressed and idle > PAGE_LIFETIME:
+            text = f"reported as held {idle:.3f} s after the finger was off"
+            self.violate("hold_is_current", at, text)
+        begins = pressed and not self._page_holds
+        if begins and self._pressed_since < self._page_ended - PAGE_LIFETIME:
+            since, ended = self._pressed_since, self._page_ended
+            text = f"held again by a press of {since:.3f} s; its hold had ended at {ended:.3f} s"
+            self.violate("hold_is_current", at, text)
+        if self._page_holds and not pressed:
+            self._page_ended = at
+        self._page_holds = pressed
 
     def observe_other_hold(self, at: float) -> None:
         """Observe a press of another source, which is a valid hold."""
@@ -198,6 +221,11 @@ class InvariantMonitor:
         self._check_status(at)
         if along > _REST_INSERTION:
             self._check_path(at, insertion, rotation)
+
+    def observe_waiting(self, at: float, waiting: int) -> None:
+        """Observe the amount of data that waits for the recorder's disk [B]."""
+        if waiting > _WAITING:
+            self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
 
     def observe_belief(self, at: float, status: ControllerStatus, *, joints_known: bool) -> None:
         """Observe a needle/controller_status published while joints reach the controller."""

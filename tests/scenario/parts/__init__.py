@@ -1,1 +1,1 @@
-"""Components of the soak besides the rig's own: bench, person, rogue nodes, tracker."""
+"""Components of the soak besides the rig's own: bench, person, rogue nodes, page."""

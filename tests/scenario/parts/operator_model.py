@@ -48,6 +48,13 @@ class JoystickButtons:
         """Whether a button that could move the needle is pressed."""
         return self.insert or self.retract
 
+    @property
+    def button(self) -> str:
+        """Button of a page that is pressed; empty for none or more than one."""
+        if self.insert is self.retract or self.stop:
+            return ""
+        return "insert" if self.insert else "retract"
+
 
 class Joystick(c.Component):
     """Publishes the state of the buttons.
@@ -93,6 +100,8 @@ class OperatorModel(c.Component):
         Whether the controller was in state DONE once.
     absent : bool
         Whether it does nothing; the hand may still move.
+    shows_lost_press : callable
+        Returns whether its input device shows a lost press.
     extra_actions : list of Action
         Actions to send in the next period.
     """
@@ -107,6 +116,7 @@ class OperatorModel(c.Component):
         self.device, self.controller = DeviceStatus(), ControllerStatus()
         self.done = False
         self.absent = False
+        self.shows_lost_press: Callable[[float], bool] = lambda _: False
         self.extra_actions: list[c.Action] = []
         self._called: dict[str, float] = {}
         self._changed_at = 0.0
@@ -179,7 +189,7 @@ class OperatorModel(c.Component):
     def _press(self, now: float, *, insert: bool, retract: bool) -> None:
         """Release other buttons and stale presses; press the given button from neutral."""
         hand = self._hand
-        lost = self.device.press_again == self._source
+        lost = self.device.press_again == self._source or self.shows_lost_press(now)
         stale = hand.holds and (insert, retract) != (hand.insert, hand.retract)
         if hand.holds and (stale or lost):
             self._release(now)

@@ -66,6 +66,8 @@ class SimulatedTracker(Component):
     ----------
     bench : SimulatedBench
         The needle, to be set before the run.
+    truth : dict of int to ndarray
+        True pose of the tip, (4, 4), by the time of its measurement [ns].
     """
 
     name = "simulated_tracker"
@@ -81,6 +83,7 @@ class SimulatedTracker(Component):
     ) -> None:
         self.model, self._spoil = model, spoil
         self._random = np.random.default_rng([seed, 77])
+        self.truth: dict[int, Array] = {}
         self._queue: list[tuple[float, bytes]] = []
         self._number = 0
         self.ports = (Port("tracker", self._ignore),)
@@ -92,6 +95,7 @@ class SimulatedTracker(Component):
     def _measure(self, at: Moment) -> Actions:
         model, random = self.model, self._random
         pose = self.bench.plant.T_rig_tip
+        self.truth[at.stamp_ns] = pose.copy()
         tilt = Rotation.from_rotvec([*random.normal(0.0, model.heading_noise, 2), 0.0])
         roll = Rotation.from_euler("z", random.uniform(-np.pi, np.pi))
         turn = Rotation.from_matrix(pose[:3, :3]) * tilt * roll

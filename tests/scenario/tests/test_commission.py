@@ -88,3 +88,8 @@ def test_a_wrong_scale_and_a_long_distance_do_not_pass() -> None:
     text = report([Row("link_loss", "unplugged", 0.5e-3, 0.3e-3)], "A. Person", datetime.date.min)
     assert "| `link_loss` | unplugged | 0.500 | 0.300 | NO |" in text
     assert "Carried out by A. Person" in text
+
+
+@pytest.mark.parametrize("measured", [0.1, float("nan")])
+def test_an_unknown_distance_is_not_a_failure(measured: float) -> None:
+    assert Row("", "", measured, 0.2).passed

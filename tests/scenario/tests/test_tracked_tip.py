@@ -73,6 +73,7 @@ class TrackedRig:
         self,
         tracker: SimulatedTracker,
         registration: Registration = EXACT,
+        steering: Any = None,
         **settings: Any,
     ) -> None:
         def observe(bench: SimulatedBench, _: SimRigParameters) -> Sensor:
@@ -80,11 +81,13 @@ class TrackedRig:
             return NoSensor()
 
         parameters = command_line_parameters(parse(["--level", "tip"]), Path("none"))
+        parameters["plane_controller"] |= steering or {}
         rig = make_rig(parameters, new_sensor=observe)
         operator = settings_of(SimulatedOperatorParameters, parameters, OPERATOR)
         tracked = TrackedTip(TrackedTipParameters(**settings), registration)
         self.tracker, self.target = tracker, rig[-1].settings.target_offset
         self.tips: list[m.PoseWithCovariance] = []
+        self.estimates: list[m.PoseWithCovariance] = []
         self.health: dict[str, str] = {}
         parts = [*rig, SimulatedOperator(operator), tracker, tracked]
         self.runner = VirtualRunner(parts, 3, compute=COMPUTE, taps=(self._note,))
@@ -92,6 +95,8 @@ class TrackedRig:
     def _note(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
         if output.topic == "needle/tip_pose":
             self.tips.append(message)
+        elif output.topic == "needle/estimate":
+            self.estimates.append(message)
         elif output == DIAGNOSTICS and sender == TrackedTip.name:
             (status,) = message.statuses
             self.health = {**status.values, "message": status.text}
@@ -107,8 +112,36 @@ class TrackedRig:
         exits = self.runner.exits
         return exits[OPERATOR].code if OPERATOR in exits else None
 
+    def normalized_errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the squared errors of position and heading over their claimed covariances."""
+        times = np.array(sorted(self.tracker.truth))
+        errors = []
+        for tip in self.tips:
+            nearest = times[np.argmin(np.abs(times - tip.stamp_ns))]
+            truth, covariance = self.tracker.truth[nearest], np.reshape(tip.covariance, (6, 6))
+            off = np.array(tip.position) - truth[:3, 3]
+            turned = Rotation.from_quat(tip.orientation).as_matrix()[:, 2]
+            turn = np.cross(truth[:3, 2], turned)
+            pairs = (off, covariance[:3, :3]), (turn, covariance[3:, 3:])
+            errors.append([error @ np.linalg.solve(claim, error) for error, claim in pairs])
+        return tuple(np.array(errors).T)
+
+    def estimate_errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors of x over their claimed sigmas, and those of the heading [rad]."""
+        times = np.array(sorted(self.tracker.truth))
+        of_x, of_heading = [], []
+        for estimate in self.estimates:
+            truth = self.tracker.truth[times[np.argmin(np.abs(times - estimate.stamp_ns))]]
+            off = estimate.position[0] - (truth[0, 3] - self.target)
+            of_x.append(off / math.sqrt(estimate.covariance[0]))
+            heading = Rotation.from_quat(estimate.orientation).as_matrix()[:, 2]
+            of_heading.append(np.linalg.norm(heading - truth[:3, 2]))
+        return np.array(of_x), np.array(of_heading)
+
 
 CASES = {
+    "40 Hz": (TrackerModel(), EXACT, {}),
+    "2 Hz": (TrackerModel(rate=2.0), EXACT, {}),
     "drop-outs": (TrackerModel(rate=4.0, lost=0.4), EXACT, {}),
     "late stamps": (TrackerModel(rate=4.0, is_late=True), EXACT, {"latency": 0.2}),
     "sensor behind the tip": (TrackerModel(rate=4.0, offset=8e-3), BEHIND, {}),
@@ -122,6 +155,27 @@ def test_a_tracker_steers_the_needle_into_the_plane(case: str) -> None:
     rig = TrackedRig(SimulatedTracker(model, 1), registration, **settings)
     assert rig.run(400.0) == EXIT_DONE
     assert abs(rig.tracker.bench.tip[0] - rig.target) < 1e-3
+    of_position, of_heading = rig.normalized_errors()
+    # Mean of chi-squared with three and two degrees of freedom, 1 by 1.
+    assert 0.7 < np.mean(of_position) / 3.0 < 1.1
+    assert 0.7 < np.mean(of_heading) / 2.0 < 1.2
+
+
+def test_a_measured_heading_improves_the_estimate() -> None:
+    early = []
+    for measured in (False, True):
+        steering = {
+            "tip_covariance": "from_tip_pose",
+            "measurement_std": 1e-4,
+            "measured_heading": measured,
+        }
+        rig = TrackedRig(SimulatedTracker(TrackerModel(rate=4.0), 1), steering=steering)
+        assert rig.run(400.0) == EXIT_DONE
+        assert abs(rig.tracker.bench.tip[0] - rig.target) < 5e-4
+        of_x, of_heading = rig.estimate_errors()
+        assert np.mean(of_x**2) < 1.1
+        early.append(np.sqrt(np.mean(of_heading[1:30] ** 2)))
+    assert early[1] < 0.5 * early[0]
 
 
 def of_matrix(change: Callable[[int, np.ndarray], Any]) -> Spoil:
@@ -132,6 +186,14 @@ def of_matrix(change: Callable[[int, np.ndarray], Any]) -> Spoil:
         return transform_message(matrix, stamp)
 
     return spoil
+
+
+def of_bytes(change: Callable[[bytes], bytes]) -> Spoil:
+    return lambda _, matrix, stamp: change(transform_message(matrix, stamp))
+
+
+def of_stamp(change: Callable[[float], float]) -> Spoil:
+    return lambda _, matrix, stamp: transform_message(matrix, change(stamp))
 
 
 def put(place: Any, value: Any) -> Spoil:
@@ -165,12 +227,13 @@ BAD_STREAMS: dict[str, tuple[Spoil, str]] = {
     "mirrored": (times(-1.0, 1.0, 1.0), "not_a_rotation"),
     "sheared": (put((0, 1), 0.9), "not_a_rotation"),
     "frozen": (of_matrix(stay_at_entry), "frozen"),
-    "clock ahead": (lambda _, matrix, stamp: transform_message(matrix, stamp + 0.5), "clock"),
-    "clock behind": (lambda _, matrix, stamp: transform_message(matrix, stamp - 1.5), "clock"),
+    "clock ahead": (of_stamp(lambda stamp: stamp + 0.5), "clock"),
+    "clock behind": (of_stamp(lambda stamp: stamp - 1.5), "clock"),
     "30 mm aside": (displaced(lambda _: (30.0, 0.0, 0.0)), "out_of_range"),
     "two places": (displaced(lambda n: (3.0 * (n % 2), 0.0, 0.0)), "jump"),
     "reversed": (times(1.0, -1.0, -1.0), "heading"),
-    "noise on the line": (lambda *_: RANDOM.bytes(120), "unreadable"),
+    "wrong bit": (of_bytes(lambda data: data[:-1] + bytes([data[-1] ^ 1])), "unreadable"),
+    "noise on the line": (of_bytes(lambda data: RANDOM.bytes(len(data))), "unreadable"),
     "short body": (
         lambda _, matrix, stamp: message("TRANSFORM", "NeedleToTracker", stamp, bytes(40)),
         "unreadable",
@@ -197,7 +260,7 @@ def test_a_bad_stream_is_named_and_moves_nothing(case: str) -> None:
     assert name in rig.health["message"] or int(rig.health[name]) > 20
 
 
-@pytest.mark.parametrize("case", ["frozen", "two places", "nothing"])
+@pytest.mark.parametrize("case", ["NaN", "frozen", "30 mm aside", "two places", "nothing"])
 def test_a_stream_that_turns_bad_stops_the_needle(case: str) -> None:
     assert advance_after(BAD_STREAMS[case][0]) < 2.2e-3
 
