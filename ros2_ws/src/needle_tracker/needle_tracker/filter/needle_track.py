@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from needle_tracker.filter.settings import FILTER
 from needle_tracker.stereo.sighting import PAIRING, Sighting
-from needle_tracker.stereo.triangulation import SpatialTip
+from needle_tracker.stereo.triangulation import SpatialTip, squared_distance
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
@@ -143,7 +143,7 @@ class NeedleMotion:
 
 def gaussian(off: Array, covariance: Array) -> tuple[float, float]:
     """Return the squared Mahalanobis distance, and the log-density."""
-    square = float(off @ np.linalg.solve(covariance, off))
+    square = squared_distance(off, covariance)
     _, log_determinant = np.linalg.slogdet(2.0 * math.pi * covariance)
     return square, -0.5 * (square + float(log_determinant))
 
@@ -368,7 +368,7 @@ def _merged(position: Array, covariance: Array, tip: SpatialTip) -> tuple[Array,
     """Return the covariance-weighted mean; a distant new position replaces the old one."""
     total = covariance + tip.covariance
     off = tip.position - position
-    if float(off @ np.linalg.solve(total, off)) > PAIRING.gate:
+    if squared_distance(off, total) > PAIRING.gate:
         return tip.position, tip.covariance
     gain = np.linalg.solve(total, covariance).T
     return position + gain @ off, covariance - gain @ covariance

@@ -15,7 +15,7 @@ from needle_tracker.detector.needle_detector import NeedleDetector
 from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.stereo.shaft_search import Shaft, find_shafts
-from needle_tracker.stereo.triangulation import SpatialTip, triangulate
+from needle_tracker.stereo.triangulation import SpatialTip, squared_distance, triangulate
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
@@ -215,8 +215,7 @@ def _distinct(sightings: Iterable[Sighting]) -> list[Sighting]:
 
 def _is_other(tip: SpatialTip, other: SpatialTip) -> bool:
     off = tip.position - other.position
-    square = off @ np.linalg.solve(tip.covariance + other.covariance, off)
-    return bool(square > PAIRING.gate)
+    return squared_distance(off, tip.covariance + other.covariance) > PAIRING.gate
 
 
 def _log_odds(chance: float) -> float:

@@ -49,6 +49,11 @@ class SpatialTip:
     misfit: float = 0.0
 
 
+def squared_distance(off: Array, covariance: Array) -> float:
+    """Return the squared Mahalanobis distance of a deviation, (3,), with its covariance, (3, 3)."""
+    return float(off @ np.linalg.solve(covariance, off))
+
+
 def triangulate(
     views: tuple[RefractedCamera, RefractedCamera], ends: tuple[ImageEnd, ImageEnd], start: Array
 ) -> SpatialTip | None:
