@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,8 +17,11 @@ from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo
 from needle_sim.path_traced.appearance import draw_appearance
 from needle_sim.path_traced.insertion import trace_insertion
 from needle_sim.path_traced.path_tracing import PathTracer, refracted_rays
+from needle_sim.path_traced.scene import Scene
 from needle_sim.path_traced.tracer import MM, Mitsuba, load_mitsuba
+from needle_sim.path_traced.world import make_world
 from needle_sim.sequences.boxes import draw_box
+from needle_sim.sequences.render_images import main
 
 CALIBRATION = Path(find_shared_file("needle_tracker", "config/calibration.yaml"))
 TOP_AND_SIDE = CALIBRATION.with_name("calibration_top_and_side.yaml")
@@ -110,6 +114,32 @@ def test_the_same_seed_gives_the_same_pairs_with_a_needle_in_them(mitsuba: Mitsu
             assert np.median(darker) > 20.0
 
 
+def test_the_command_fills_a_folder(mitsuba: Mitsuba, tmp_path: Path) -> None:
+    argv = ["--renderer", "path_traced", "--appearance", "absent", "--frames", "1"]
+    output = tmp_path / "out"
+    assert main(["--output", str(output), "--calibration", str(CALIBRATION), *argv]) == 0
+    with (output / "truth.csv").open(encoding="utf-8", newline="") as stream:
+        (row,) = csv.DictReader(stream)
+    assert row["axis_x_mm"] == row["needle"] == ""
+    assert row["bottom"] != ""
+
+
+def test_mirroring_the_floor_mirrors_its_image(mitsuba: Mitsuba) -> None:
+    look = dataclasses.replace(draw_appearance("drawn_on_grey", 3), bubbles=0)
+    world = make_world(load_stereo_rig(CALIBRATION), look)
+    backdrop = world.backdrops[0]
+    shape = backdrop.picture.shape
+    slanting = np.linspace(0.1, 0.5, shape[0])[:, np.newaxis] + np.linspace(0.0, 0.4, shape[1])
+    backdrop = dataclasses.replace(backdrop, picture=slanting.astype(np.float32))
+    scene = Scene(mitsuba, dataclasses.replace(world, backdrops=(backdrop, backdrop)))
+    points = np.array([[look.floor_height, y, z] for y in (-0.04, 0.05) for z in (0.02, 0.12)])
+    above = (MM * (points + np.array([0.01, 0.0, 0.0]))).astype(np.float32)
+    down = mitsuba.mi.Vector3f(-1.0, 0.0, 0.0)
+    hit = scene.tracer.ray_intersect(mitsuba.mi.Ray3f(mitsuba.mi.Point3f(*above.T), down))
+    pixel = np.asarray(hit.bsdf().eval_diffuse_reflectance(hit)).ravel()
+    np.testing.assert_allclose(pixel, backdrop.reflectance(points[np.newaxis])[0], atol=0.002)
+
+
 def test_a_needle_in_a_box_is_seen_by_both_and_farther_in_by_the_later_one(
     mitsuba: Mitsuba, tmp_path: Path
 ) -> None:
@@ -137,3 +167,22 @@ def test_a_needle_in_a_box_is_seen_by_both_and_farther_in_by_the_later_one(
     ends = [mesh.line[-1, 2] for mesh in later.meshes]
     assert ends[1] - ends[0] == pytest.approx(0.002, abs=1e-4)
     assert np.any(later.images[1] != first.images[1])
+
+
+def test_haze_fades_deep_objects_and_not_near_ones(mitsuba: Mitsuba) -> None:
+    rig = quarter_size(load_stereo_rig(CALIBRATION))
+    look = dataclasses.replace(
+        draw_appearance("painted_on_print", 3), bubbles=0, noise=0.4, lag=0.0, flicker=0.0
+    )
+    clear, hazy = (
+        next(
+            trace_insertion(
+                mitsuba, rig, dataclasses.replace(look, haze=haze), frames=1, depth=0.05, begin=0.05
+            )
+        )
+        .images[0][:, 60:]
+        .astype(float)
+        for haze in (0.0, 0.35)
+    )
+    assert np.median(hazy) == pytest.approx(np.median(clear), abs=6.0)
+    assert 0.5 < hazy.std() / clear.std() < 0.8

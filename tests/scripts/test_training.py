@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 import warnings
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from code_lines import ROOT
-from needle_bringup.training.samples import CANVAS, SIZE, Sample
+from needle_bringup.training.samples import BORDER, CANVAS, SIZE, Sample
 from needle_bringup.training.traced_scenes import TracedScene
 from needle_tracker.detector.needle_net import normalized
-from net_report import report
+from net_report import end_error, peaks, report
 from sample_pool import CONTEXT, SHARD, Pool, batch_of, read_shard, write_shard
 
+TRAINING = "only scripts/train_needle_map installs torch and onnx"
 WEIGHTS = ROOT / "ros2_ws/src/needle_tracker/needle_tracker/detector/needle_net.onnx"
 END = np.array([60.0, 90.0])
 _COUNT = 16
@@ -76,6 +78,17 @@ def test_a_background_that_is_not_known_is_zero(folder: Path) -> None:
     np.testing.assert_array_equal(batch.inputs[:, 1].any(axis=(1, 2)), known)
 
 
+def test_an_end_outside_the_patch_is_none(tmp_path: Path) -> None:
+    def outside(rng: np.random.Generator) -> Sample:
+        sample = flat_sample(rng)
+        sample.end[:] = BORDER - 2.0, 90.0
+        return sample
+
+    write_shard(tmp_path / "drawn-00000.npz", [0], outside)
+    batch = batch_of([(read_shard(tmp_path / "drawn-00000.npz"), 0)], [0], [False])
+    assert np.isnan(batch.ends).all()
+
+
 def test_a_pool_adds_new_files_and_drops_removed_ones(folder: Path, tmp_path: Path) -> None:
     pool = Pool(tmp_path)
     assert pool.update() == 0
@@ -88,11 +101,58 @@ def test_a_pool_adds_new_files_and_drops_removed_ones(folder: Path, tmp_path: Pa
     assert pool.update() == SHARD
 
 
+def torch_and_loop() -> tuple[Any, Any]:
+    torch = pytest.importorskip("torch", reason=TRAINING)
+    pytest.importorskip("onnx", reason=TRAINING)
+    return torch, pytest.importorskip("training_loop")
+
+
+def test_the_loss_of_ends_is_least_at_the_true_intensity() -> None:
+    torch, loop = torch_and_loop()
+    rows, columns = np.indices((40, 40))
+    spread, chance = 1.5, 0.7
+    errors = np.random.default_rng(0).normal(0.0, spread, (600, 2)) + 20.0
+    errors[int(chance * len(errors)) :] = np.nan
+    ends = torch.from_numpy(errors.astype(np.float32))
+
+    def loss(sigma: float, total: float) -> float:
+        peak = np.exp(-((rows - 20.0) ** 2 + (columns - 20.0) ** 2) / (2 * sigma**2))
+        peak = np.log(total * peak / peak.sum() + 1e-6)
+        tiled = np.repeat(peak[None].astype(np.float32), len(errors), 0)
+        return float(loop.end_loss(torch.from_numpy(tiled), ends))
+
+    least = loss(spread, chance)
+    for sigma, total in ((1.0, chance), (2.2, chance), (spread, 0.5), (spread, 1.0)):
+        assert loss(sigma, total) > least
+
+
+def test_an_intensity_that_was_cut_off_returns() -> None:
+    torch, loop = torch_and_loop()
+    low = torch.full((1, 20, 20), -30.0, requires_grad=True)
+    loop.end_loss(low, torch.tensor([[10.5, 9.5]])).backward()
+    assert float(low.grad[0, 9, 10]) == pytest.approx(-0.25, rel=0.01)
+
+
+def test_the_rate_rises_then_falls_to_nearly_nothing() -> None:
+    _, loop = torch_and_loop()
+    rates = [loop.rate_share(progress) for progress in np.linspace(0.0, 1.0, 101)]
+    assert max(rates) == pytest.approx(loop.rate_share(0.08))
+    assert np.all(np.diff(rates[8:]) <= 0.0)
+    assert rates[-1] < 0.01 * max(rates)
+
+
+def test_a_net_that_diverges_ends_the_run_and_is_not_stored(folder: Path, tmp_path: Path) -> None:
+    torch, loop = torch_and_loop()
+    run = loop.new_run(0)
+    with torch.no_grad():
+        run.net.out.weight.mul_(1e6)
+    with pytest.raises(RuntimeError, match="diverged at step 0: resume from"):
+        loop.train(run, Pool(folder), loop.Plan(40, 5.0, tmp_path / "n.onnx", tmp_path / "c.pt"))
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_run_is_resumed_exactly_and_opencv_reads_its_net(folder: Path, tmp_path: Path) -> None:
-    reason = "only scripts/train_needle_map installs torch and onnx"
-    torch = pytest.importorskip("torch", reason=reason)
-    pytest.importorskip("onnx", reason=reason)
-    loop = pytest.importorskip("training_loop")
+    torch, loop = torch_and_loop()
     pool = Pool(folder)
     paths = tmp_path / "needle_net.onnx", tmp_path / "checkpoint.pt"
     run = loop.new_run(3)
@@ -108,8 +168,8 @@ def test_a_run_is_resumed_exactly_and_opencv_reads_its_net(folder: Path, tmp_pat
     # It continues with its own samples, and not beyond its end.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for _ in range(2):
-            loop.train(other, Pool(folder), loop.Plan(6, 5.0, tmp_path / "other.onnx", paths[1]))
+        loop.train(other, Pool(folder), loop.Plan(6, 5.0, tmp_path / "other.onnx", paths[1]))
+        loop.train(other, Pool(folder), loop.Plan(6, 5.0, tmp_path / "other.onnx", paths[1]))
     assert run.step == 4
     assert other.step == 6
     # Any multiples of 4: the stored net has no fixed size.
@@ -122,6 +182,39 @@ def test_a_run_is_resumed_exactly_and_opencv_reads_its_net(folder: Path, tmp_pat
     for got, want in zip(stored.forward(["shaft", "end"]), expected, strict=True):
         np.testing.assert_allclose(got, want.numpy(), atol=1e-4)
     assert 0.0 < float(expected[0].min()) < float(expected[0].max()) < 1.0
+
+
+def test_a_net_from_stored_weights_equals_the_stored_net(tmp_path: Path) -> None:
+    torch, loop = torch_and_loop()
+    net = pytest.importorskip("training_net")
+    path = tmp_path / "needle_net.onnx"
+    inputs = torch.from_numpy(np.random.default_rng(0).normal(0.0, 1.0, (2, 2, 64, 64)))
+    run = loop.new_run(5)
+    run.net(inputs.float())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        net.export(run.net, path)
+    tuned = loop.new_run(0, path)
+    with torch.no_grad():
+        one, other = (each.net.eval()(inputs.float()) for each in (run, tuned))
+    np.testing.assert_allclose(one.numpy(), other.numpy(), atol=1e-4)
+    assert tuned.rate < run.rate
+
+
+def test_a_peak_is_judged_along_and_across_the_shaft() -> None:
+    rows, columns = np.indices((80, 80))
+    share = ((np.abs(rows - 40) < 3) & (columns < 50)).astype(float)
+    end = np.array([49.5, 40.0])
+    peak = np.exp(-0.5 * (((columns - 51.2) / 2.0) ** 2 + ((rows - 40.0) / 0.5) ** 2))
+    intensity = 0.9 * peak / peak.sum()
+    error = end_error(intensity, share, end)
+    assert error is not None
+    assert error.along == pytest.approx(1.7, abs=0.15)
+    assert error.across == pytest.approx(0.0, abs=0.05)
+    assert error.sigmas == pytest.approx(0.85, rel=0.2)
+    np.testing.assert_array_equal(peaks(intensity + 1e-9), [[51, 40]])
+    assert end_error(0.3 * intensity, share, end) is None
+    assert not len(peaks(0.3 * intensity))
 
 
 def test_the_report_counts_ends_and_false_ends_by_width_and_background() -> None:

@@ -1,4 +1,4 @@
-"""Behaviour of `needle_core` that needs real processes."""
+"""Behaviour of `needle_core` that needs real processes or rcl."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ import signal
 import subprocess
 import sys
 import uuid
+from pathlib import Path
 
 import pytest
+from rclpy.context import Context
+from rclpy.node import Node
 
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import FIRST_PARTICIPANT, Claim, ports_of, reserve_domain_id
 from needle_core.process.shared_memory import SHARED_MEMORY
+from needle_core.settings.parameter_files import values_for
 
 
 def test_a_node_starts_after_a_port_was_left_incomplete() -> None:
@@ -142,3 +146,35 @@ def test_a_kill_releases_the_name_of_a_process() -> None:
         first.kill()
         first.wait()
         Claim(name, "/second").release()
+
+
+REMAPPINGS = {
+    "/device_driver": (),
+    "/rig1/device_driver": ("-r", "__ns:=/rig1"),
+    "/a/b/device_driver": ("-r", "__ns:=/a/b"),
+    "/other": ("-r", "__node:=other"),
+    "/rig1/other": ("-r", "device_driver:__node:=other", "-r", "other:__ns:=/rig1"),
+}
+NAMES = (
+    *("device_driver", "/device_driver", "other", "/rig1/device_driver", "rig1/device_driver"),
+    *("/rig1/other", "/rig2/device_driver", "/a/b/device_driver", "/**", "/*", "/*/*", "/rig1/*"),
+    *("/rig1/**", "/a/**", "/**/device_driver", "/**/other", "/*/device_driver", "**", "/**/b/*"),
+    *("/rig1/**/device_driver", "/**/rig1/device_driver", "/a/*/device_driver", "**/device_driver"),
+)
+
+
+@pytest.mark.parametrize("node", REMAPPINGS)
+def test_a_node_gets_the_same_sections_as_from_rcl(tmp_path: Path, node: str) -> None:
+    sections = {name: {f"p{i}": i, "last": i} for i, name in enumerate(NAMES)}
+    file = tmp_path / "p.yaml"
+    file.write_text("".join(f"'{n}': {{ros__parameters: {v}}}\n" for n, v in sections.items()))
+    with reserve_domain_id() as domain:
+        context = Context()
+        words = ["--ros-args", "--params-file", str(file), *REMAPPINGS[node]]
+        context.init(["node", *words], domain_id=domain)
+        made = Node("device_driver", context=context)
+        given = {name: one.value for name, one in made._parameter_overrides.items()}
+        assert made.get_fully_qualified_name() == node
+        made.destroy_node()
+        context.try_shutdown()
+    assert given == values_for(file, sections, node, "device_driver")
