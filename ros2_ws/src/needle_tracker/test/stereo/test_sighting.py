@@ -72,10 +72,11 @@ def search(views: Views) -> Search:
         right: list[np.ndarray],
         *,
         are_thin: bool = False,
+        ends: float = 0.95,
         shafts: tuple[float, float] = (0.9, 0.9),
     ) -> StereoSearch:
         detectors = tuple(
-            DrawnLines(view, lines, are_thin, shaft=shaft)
+            DrawnLines(view, lines, are_thin, ends, shaft)
             for view, lines, shaft in zip(views, (left, right), shafts, strict=True)
         )
         return StereoSearch(views, detectors, settings)  # type: ignore[arg-type]
@@ -112,6 +113,13 @@ def test_one_view_may_hide_the_shaft_but_not_both(search: Search, needle: np.nda
     for shafts, count in (((0.3, 0.9), 1), ((0.3, 0.3), 0)):
         found = search([needle], [needle], shafts=shafts).search(3e-3, 0.15)[0]
         assert len(found) == count
+
+
+@pytest.mark.parametrize(("ends", "count"), [(0.2, 1), (0.1, 0)])
+def test_hardly_visible_ends_are_no_sighting(
+    search: Search, needle: np.ndarray, ends: float, count: int
+) -> None:
+    assert len(search([needle], [needle], ends=ends).search(3e-3, 0.15)[0]) == count
 
 
 def test_a_line_in_only_one_view_is_no_sighting(search: Search, needle: np.ndarray) -> None:
