@@ -20,10 +20,10 @@ from needle_bringup.operator.component import DEVICE_STOP
 from needle_console.console import CALLS as OF_BUTTONS
 from needle_console.console import PAGE, HoldRequest
 from needle_console.hold.page_session import RELEASED
-from needle_console.hold.retraction import RETRACT, STOP_STEERING
 from needle_core.component import Action, Call, Component, Diagnose, Moment, Peers
 from needle_core.convert import from_ros, ros_type
 from needle_core.message_types import rclpy_types
+from needle_core.retraction import RETRACT, STOP_STEERING
 from needle_core.runners.process import Handlers
 from reference.endpoints import CALLS, PUBLISHES, SERVES, SOURCES, Endpoint, endpoints_of, service
 

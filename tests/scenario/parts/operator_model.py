@@ -174,7 +174,7 @@ class OperatorModel(c.Component):
         is_out = self._insertion() < OUT
         steering = self.controller.state
         if self.goal is OperatorGoal.INSERT and self.device.homed:
-            if steering in ("STEERING", "WAITING_FOR_TIP"):
+            if self.controller.is_steering:
                 return True, False, None
             if is_out and steering in ("IDLE", "DONE", "FAULT") and not self.done:
                 return False, False, ("plane_controller/start", None)

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_console.console_parameters import ConsoleParameters
-from needle_console.hold.page_session import OWNER, PageHold
-from needle_console.hold.retraction import Retraction
-from needle_console.view.advice import STEERING, Button
+from needle_console.hold.page_session import OWNER, Mode, PageHold
+from needle_console.view.advice import Button
 from needle_console.view.camera_view import SIDES
 from needle_console.view.rig_picture import RigPicture
 from needle_console.view.snapshot import Array, Snapshot
@@ -41,6 +40,7 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import HoldSession
+from needle_core.retraction import Retraction
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_tracker.optics.calibration import rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, grey_image
@@ -201,14 +201,13 @@ class Console(Component):
         self._hold_at, self._refusals = at.steady, request.refusals
         rig, hold = self._picture.latest(), request.hold
         order = self._retraction.update(
-            hold,
+            hold.pressed and hold.mode is Mode.RETRACT,
             at.steady,
-            steering=rig.controller is not None and rig.controller.state in STEERING,
-            hold_counts=rig.device is not None
-            and rig.device.hold_owner == OWNER
-            and rig.device.activity == "none",
+            steering=rig.controller is not None and rig.controller.is_steering,
+            hold_counts=rig.device is not None and rig.device.is_idle_for(OWNER),
         )
-        yield self._publish_hold(at, pressed=order.press, speed=hold.speed)
+        inserts = hold.pressed and hold.mode is Mode.INSERT
+        yield self._publish_hold(at, pressed=inserts or order.press, speed=hold.speed)
         yield from map(Call, order.calls)
         if was_silent:
             yield from self._check(at)

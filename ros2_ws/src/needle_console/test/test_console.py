@@ -118,6 +118,10 @@ def test_retraction_waits_for_the_end_of_steering(bench: Bench) -> None:
         bench.receive("device/status", DeviceStatus(hold_owner=owner))
         (published,), made = bench.hold(RETRACT)
         assert (published.pressed, made) == (pressed, calls)
+    # An insertion is passed on to a controller that steers.
+    bench.receive("needle/controller_status", ControllerStatus(state="STEERING"))
+    (published,), made = bench.hold(INSERT)
+    assert (published.pressed, made) == (True, [])
 
 
 def test_buttons_call_their_services_and_answers_are_shown(bench: Bench) -> None:

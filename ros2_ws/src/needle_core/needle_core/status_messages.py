@@ -133,6 +133,10 @@ class DeviceStatus(KeyValues):
         """The fault if there is one, else the reason, else the line for the user."""
         return self.fault or self.reason or self.text
 
+    def is_idle_for(self, owner: str) -> bool:
+        """Return whether this owner's hold counts and nothing moves."""
+        return self.hold_owner == owner and self.activity == "none"
+
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerStatus(KeyValues):
@@ -202,6 +206,11 @@ class ControllerStatus(KeyValues):
     preset: str = ""
     depth_m: float | None = None
     heard: str = ""
+
+    @property
+    def is_steering(self) -> bool:
+        """Whether the controller sends steps as soon as a hold counts."""
+        return self.state in {"STEERING", "WAITING_FOR_TIP"}
 
 
 def _number(text: str) -> float:

@@ -85,8 +85,7 @@ class SimRig(Component):
 
     def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
         is_continuous = message.insertion == "continuous"
-        is_steering = message.state in ("STEERING", "WAITING_FOR_TIP")
-        self._is_tip_awaited = message.awaiting == "tip" or (is_continuous and is_steering)
+        self._is_tip_awaited = message.awaiting == "tip" or (is_continuous and message.is_steering)
         return ()
 
     def _cycle(self, at: Moment) -> Actions:

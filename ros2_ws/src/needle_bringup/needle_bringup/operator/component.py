@@ -12,7 +12,6 @@ from needle_bringup.operator.hold_debouncer import (
 )
 from needle_bringup.operator.joy_source import JoySource
 from needle_bringup.operator.parameters import JOY, PERIOD, OperatorParameters
-from needle_bringup.operator.retraction import STOP_STEERING, RetractionSequence
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_DONE
 from needle_core.component import (
@@ -36,9 +35,11 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import HoldSession
-from needle_core.status_messages import DeviceStatus
+from needle_core.retraction import RETRACT, STOP_STEERING, Retraction
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 HOLD, INPUT_DEVICE = "device/hold", "input device"
+CONTROLLER_STATUS = "needle/controller_status"
 DEVICE_STOP = "device/stop"
 RELEASES = 3
 """Number of final release messages, as delivery of the hold is best effort."""
@@ -68,12 +69,17 @@ class Operator(Component):
         self._peers = Peers()
         self._joy, self._joy_topic = JoySource(settings), joy
         self._debouncer = HoldDebouncer()
-        self._retraction = RetractionSequence(name)
+        self._retraction = Retraction()
+        self._device, self._controller = DeviceStatus(), ControllerStatus()
         self._decision = HoldDecision()
-        self._release_required = False
+        # Reason why a call of the current retraction failed.
+        self._refusal = ""
         self._last_text = ""
         self._session = HoldSession(name)
-        self.inputs = (Input("device/status", DeviceStatus, self._on_device, LATCHED),)
+        self.inputs = (
+            Input("device/status", DeviceStatus, self._on_device, LATCHED),
+            Input(CONTROLLER_STATUS, ControllerStatus, self._on_controller, LATCHED),
+        )
         self.outputs = (Output(HOLD, m.HoldState, BEST_EFFORT),)
         if settings.source == JOY:
             # Queue depth 1: messages queued during a stall are outdated.
@@ -89,14 +95,16 @@ class Operator(Component):
             yield Send(INPUT_DEVICE, (settings.speed_scale,))
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Store the discovered services and joystick publishers."""
+        """Store the joystick's publishers, and forget a controller that has ended."""
         self._peers = peers
+        if CONTROLLER_STATUS not in peers.publishers:
+            self._controller = ControllerStatus()
         return ()
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
-        """Handle the answer to a call."""
-        if answer.answered:
-            self._retraction.handle_answer(answer.service, answer.success, answer.text, at.steady)
+        """Store the reason why a retraction fails."""
+        if answer.service in {STOP_STEERING, RETRACT} and not answer.success:
+            self._refusal = f"{answer.service}: {answer.text}"
         return ()
 
     def on_stop(self, at: Moment) -> Actions:
@@ -122,22 +130,28 @@ class Operator(Component):
 
     def _update(self, reading: InputReading, at: Moment) -> Actions:
         decision = self._decision = self._debouncer.update(reading, at.steady)
-        call = self._retraction.update(
-            decision.kind is HoldKind.RETRACT,
+        retracts = decision.kind is HoldKind.RETRACT
+        order = self._retraction.update(
+            retracts,
             at.steady,
-            controller=STOP_STEERING in self._peers.services,
+            steering=self._controller.is_steering,
+            hold_counts=self._device.is_idle_for(self.name),
         )
-        pressed = decision.kind is HoldKind.INSERT or self._retraction.holds
+        if not retracts:
+            self._refusal = ""
+        pressed = decision.kind is HoldKind.INSERT or order.press
         yield self._hold(at, pressed=pressed, speed=decision.speed)
         if decision.stop:
             yield Call(DEVICE_STOP)
-        if call is not None:
-            yield Call(call)
+        yield from map(Call, order.calls)
         yield from self._report()
 
     def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:
-        self._release_required = message.press_again == self.name
-        self._retraction.handle_device(message.hold_owner, message.activity, at.steady)
+        self._device = message
+        return ()
+
+    def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
+        self._controller = message
         return ()
 
     def _report(self) -> Actions:
@@ -151,11 +165,11 @@ class Operator(Component):
         decision = self._decision
         if decision.problem:
             return Level.WARN, f"nothing is held: {decision.problem}"
-        if self._retraction.problem:
-            return Level.WARN, f"not withdrawn: {self._retraction.problem}"
+        if self._refusal:
+            return Level.WARN, f"not withdrawn: {self._refusal}"
         if decision.ignored_press:
             return Level.WARN, "the press is ignored: release all buttons, then press again"
-        if self._release_required and decision.kind is not HoldKind.NOTHING:
+        if self._device.press_again == self.name and decision.kind is not HoldKind.NOTHING:
             return Level.WARN, "the device ignores this press: release, then press again"
         return Level.OK, {
             HoldKind.NOTHING: "nothing is held",

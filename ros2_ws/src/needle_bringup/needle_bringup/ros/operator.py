@@ -23,7 +23,7 @@ until all are released and it is pressed again. Before a retraction, a steering 
 stopped.
 
 Publishes   device/hold
-Subscribes  joy (source joy), device/status
+Subscribes  joy (source joy), device/status, needle/controller_status
 Calls       device/stop, device/retract, plane_controller/stop
 """
 

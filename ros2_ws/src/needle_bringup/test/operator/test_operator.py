@@ -25,11 +25,12 @@ from needle_core.component import (
     Send,
 )
 from needle_core.errors import UserError
-from needle_core.status_messages import DeviceStatus
+from needle_core.retraction import BEGINS_WITHIN, RETRACT, STOP_STEERING
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 PEDAL = OperatorParameters(device="/dev/input/pedal", key=48, retract_key=49, stop_key=50)
 JOYSTICK = OperatorParameters(source="joy", key=0, retract_key=1, stop_key=2, speed_axis=0)
-STOP_STEERING, RETRACT, STOP = "plane_controller/stop", "device/retract", "device/stop"
+STOP = "device/stop"
 NEUTRAL, OUT = InputState(), InputState(retract=True)
 
 
@@ -42,7 +43,8 @@ class Scene:
         self.holds: list[m.HoldState] = []
         self.called: list[str] = []
         self.logs: list[str] = []
-        peers = Peers({"joy": ("joy_node",)}, services=frozenset({STOP_STEERING, RETRACT, STOP}))
+        self.accepts = True
+        peers = Peers({"joy": ("joy_node",), "needle/controller_status": ("plane_controller",)})
         self.execute(self.operator.on_peers(peers, self.at))
 
     @property
@@ -57,18 +59,23 @@ class Scene:
                 self.logs.append(action.text)
             elif isinstance(action, Call):
                 self.called.append(action.service)
-                self.execute(self.operator.on_answer(Answer(action.service, True, ""), self.at))
+                answer = Answer(action.service, self.accepts, "not now")
+                self.execute(self.operator.on_answer(answer, self.at))
             else:
                 assert isinstance(action, Diagnose)
 
     def update(self, reading: InputReading = NEUTRAL, **status: Any) -> m.HoldState:
         """Handle a device status, then a reading of the port."""
         self.now += PERIOD
-        (row,), (port,) = self.operator.inputs, self.operator.ports
+        (row, _), (port,) = self.operator.inputs, self.operator.ports
         if status:
             self.execute(row.handler(DeviceStatus(**status), self.at))
         self.execute(port.handler((InputLost("an older reading"), reading), self.at))
         return self.holds[-1]
+
+    def steer(self, state: str) -> None:
+        """Handle a status of the controller."""
+        self.execute(self.operator.inputs[1].handler(ControllerStatus(state=state), self.at))
 
     def joy(self, *down: int, silent: bool = False) -> m.HoldState:
         """Handle a joystick message, then run the timer."""
@@ -76,7 +83,7 @@ class Scene:
         buttons = tuple(int(button in down) for button in range(3))
         if not silent:
             message = m.Joystick(self.at.stamp_ns, (0.6,), buttons)
-            self.execute(self.operator.inputs[1].handler(message, self.at))
+            self.execute(self.operator.inputs[-1].handler(message, self.at))
         self.execute(self.operator.timers[0].handler(self.at))
         return self.holds[-1]
 
@@ -118,15 +125,35 @@ def test_a_joystick_holds_sets_the_speed_stops_and_times_out() -> None:
 def test_the_controller_is_stopped_before_a_withdrawal() -> None:
     scene = Scene(PEDAL)
     scene.update()
-    # This hold was published before the answer arrived.
+    scene.steer("STEERING")
     assert not scene.update(OUT).pressed
     assert scene.called == [STOP_STEERING]
+    scene.steer("IDLE")
     assert scene.update(OUT).pressed
     assert scene.logs[-1] == "held to withdraw the needle"
     scene.update(OUT, hold_owner="operator")
     assert scene.called == [STOP_STEERING, RETRACT]
     assert scene.update(OUT, hold_owner="operator", activity="retraction").pressed
-    assert not scene.update(OUT, activity="none").pressed
+    scene.now += BEGINS_WITHIN
+    assert not scene.update(OUT, hold_owner="operator").pressed
+
+
+def test_an_ended_controller_does_not_prevent_a_withdrawal() -> None:
+    scene = Scene(PEDAL)
+    scene.update()
+    scene.steer("STEERING")
+    scene.execute(scene.operator.on_peers(Peers(), scene.at))
+    assert scene.update(OUT).pressed
+
+
+def test_a_refused_withdrawal_is_reported_until_the_release() -> None:
+    scene = Scene(PEDAL)
+    scene.update()
+    scene.accepts = False
+    scene.update(OUT, hold_owner="operator")
+    assert scene.logs[-1] == "not withdrawn: device/retract: not now"
+    scene.update()
+    assert scene.logs[-1] == "nothing is held"
 
 
 def test_a_new_speed_is_applied_and_the_end_releases() -> None:

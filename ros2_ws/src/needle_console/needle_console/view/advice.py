@@ -11,8 +11,6 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 # The needle counts as out if the insertion is smaller than this [m].
 _OUT = 1e-4
-STEERING = ("STEERING", "WAITING_FOR_TIP")
-"""States in which the controller steers."""
 
 
 class Button(enum.Enum):
@@ -80,7 +78,7 @@ def advise(snapshot: Snapshot, name: str) -> Advice:  # noqa: PLR0911 - each ret
         case "DISABLED":
             return _disabled(device)
         case "HOLDING":
-            steers = controller is not None and controller.state in STEERING
+            steers = controller is not None and controller.is_steering
             if steers and device.press_again == name:
                 return Advice("The press is ignored", "Release, then press and hold again.")
             return _holding(snapshot, device)
@@ -94,7 +92,7 @@ def usable_buttons(snapshot: Snapshot) -> frozenset[Button]:
         return frozenset()
     if device.state == "DISABLED" and math.isnan(snapshot.insertion):
         return frozenset({Button.RESET})
-    steering = controller is not None and controller.state in STEERING
+    steering = controller is not None and controller.is_steering
     found = {
         "DISABLED": {Button.CONFIRM, Button.ENABLE, Button.RESET},
         "HOLDING": {Button.CONFIRM, Button.RETRACT, Button.SWITCH_OFF, Button.RESET},
@@ -141,7 +139,7 @@ def _holding(snapshot: Snapshot, device: DeviceStatus) -> Advice:
         )
     if controller is None:
         return Advice("No controller", "Start plane_controller.")
-    if controller.state in STEERING:
+    if controller.is_steering:
         return _steering(controller, device)
     return _not_steering(controller, is_in=snapshot.insertion > _OUT)
 

@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from needle_console.hold.page_session import RELEASED, Mode, PageHold
-from needle_console.hold.retraction import RETRACT, STOP_STEERING, HoldOrder, Retraction
+from needle_core.retraction import RETRACT, STOP_STEERING, HoldOrder, Retraction
 
-INSERT = PageHold(True, 1.0, Mode.INSERT)
-OUT = PageHold(True, 1.0, Mode.RETRACT)
+RELEASED, OUT = False, True
 HELD, FREE = HoldOrder(True), HoldOrder(False)
 STOPS, RETRACTS = HoldOrder(False, (STOP_STEERING,)), HoldOrder(True, (RETRACT,))
 # Button, time [s], whether a controller steers, whether the hold counts; the order.
-Step = tuple[PageHold, float, bool, bool, HoldOrder]
+Step = tuple[bool, float, bool, bool, HoldOrder]
 STORIES: dict[str, tuple[Step, ...]] = {
-    "insertion is passed on unchanged": (
-        (INSERT, 0.0, True, True, HELD),
-        (RELEASED, 9.0, True, False, FREE),
-        (INSERT, 9.1, False, True, HELD),
-        (RELEASED, 9.2, False, False, FREE),
-    ),
     "steering stops first, and each service is called once": (
         (OUT, 0.0, True, False, STOPS),
         (OUT, 0.0, True, False, FREE),
@@ -50,5 +42,5 @@ STORIES: dict[str, tuple[Step, ...]] = {
 @pytest.mark.parametrize("story", STORIES)
 def test_a_retraction_orders_hold_and_services(story: str) -> None:
     retraction = Retraction()
-    for hold, now, steering, counts, order in STORIES[story]:
-        assert retraction.update(hold, now, steering=steering, hold_counts=counts) == order
+    for held, now, steering, counts, order in STORIES[story]:
+        assert retraction.update(held, now, steering=steering, hold_counts=counts) == order

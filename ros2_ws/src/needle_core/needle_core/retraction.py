@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-from needle_console.hold.page_session import Mode, PageHold
-
 STOP_STEERING = "plane_controller/stop"
 RETRACT = "device/retract"
 BEGINS_WITHIN = 1.0
@@ -41,24 +39,24 @@ class Retraction:
         self._called: dict[str, float] = {}
         self._over = False
 
-    def update(self, hold: PageHold, now: float, *, steering: bool, hold_counts: bool) -> HoldOrder:
+    def update(self, held: bool, now: float, *, steering: bool, hold_counts: bool) -> HoldOrder:
         """Return the hold to publish and the services to call.
 
         Parameters
         ----------
-        hold : PageHold
-            State of the button.
+        held : bool
+            Whether the button to retract is held.
         now : float
             Steady time [s].
         steering : bool
             Whether a controller steers.
         hold_counts : bool
-            Whether the console owns the device's hold and nothing moves.
+            Whether this node owns the device's hold and nothing moves.
         """
-        if not hold.pressed or hold.mode is not Mode.RETRACT:
+        if not held:
             self._called.clear()
             self._over = False
-            return HoldOrder(hold.pressed)
+            return HoldOrder(False)
         if steering and RETRACT not in self._called:
             return HoldOrder(False, self._call_once(STOP_STEERING, now))
         if hold_counts and now - self._called.get(RETRACT, now) > BEGINS_WITHIN:
