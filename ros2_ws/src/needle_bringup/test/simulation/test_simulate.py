@@ -22,7 +22,6 @@ from needle_core.component import Actions, Component, Exit, Moment, Timer
 from needle_core.errors import UserError
 from needle_core.status_messages import ControllerStatus
 
-pytestmark = pytest.mark.usefixtures("compiled")
 WORDS = ("--level", "tip", "--depth-mm", "4", "--initial", "0.2,0,0")
 KEYS = {
     *("level", "controller", "seed", "steps", "converged", "r1_final_mm", "r1_rms_last_20_mm"),

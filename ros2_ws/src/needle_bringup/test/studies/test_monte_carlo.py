@@ -15,7 +15,6 @@ from needle_bringup.studies.monte_carlo import main
 from needle_bringup.studies.monte_carlo_options import parse
 from needle_bringup.studies.study_parts import parts_of, results_of
 
-pytestmark = pytest.mark.usefixtures("compiled")
 # Invalid combinations and forms, and the part that the error names; `number` checks the bounds.
 REFUSED = (
     ("--grid hexagonal", "hexagonal"),

@@ -22,7 +22,6 @@ from needle_controller.model.arrays import Array
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import SteeringSettings
 
-pytestmark = pytest.mark.usefixtures("compiled")
 TIPS = np.array([[0.0005, 0.0, 0.001], [-0.0005, 0.0, 0.0012]])
 
 
