@@ -231,9 +231,12 @@ class NeedleTracker:
     def _view_changed(self, pair: Pair) -> bool:
         """Return whether the brightness of most of a view changed since the previous pair."""
         before, shrink = self._views_before, FOLLOWING.glance_shrink
+        # Every fourth row and column suffices for the mean, and is read much faster.
         self._views_before = tuple(
             cv2.resize(
-                image, (width // shrink, height // shrink), interpolation=cv2.INTER_AREA
+                np.ascontiguousarray(image[::4, ::4]),
+                (width // shrink, height // shrink),
+                interpolation=cv2.INTER_AREA,
             ).astype(np.float64)
             for image, (height, width) in zip(pair, self._shapes, strict=True)
         )
