@@ -13,12 +13,10 @@ from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.filter.needle_tracker import Image, NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.sources.image_encodings import Frame
 from needle_tracker.sources.pairing import InsertionHistory, Pair, PairMatcher
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
@@ -93,14 +91,6 @@ class SwapWatch:
         swapped = self._swapped.process(right, left, insertion)
         self._agreeing = self._agreeing + 1 if swapped.tip is not None else 0
         self.suspected = self._agreeing >= _AGREEING
-
-
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """A received image: `pixels` (shared with the message), or the problem with it."""
-
-    pixels: NDArray[np.uint8] | None
-    problem: str = ""
 
 
 class CameraInfoProblem(NamedTuple):
