@@ -24,7 +24,7 @@ from needle_core.component import (
     Publish,
     Timer,
 )
-from needle_core.diagnostics import Diagnostic, Level
+from needle_core.diagnostics import Level
 from needle_core.files.installed import find_shared_file
 from needle_core.files.yaml_files import read_calibration
 from needle_tracker.answers.annotation import annotate
@@ -84,7 +84,7 @@ class StereoTipTracker(Component):
         self._calibration_text = calibration_text
         self._is_calibration_published = False
         self.answers = PairAnswers(calibration, settings)
-        self._health = Health()
+        self._health = Health(self.answers)
         rate = settings.annotated_rate
         self._annotated_period = 1.0 / rate if rate > 0.0 else math.inf
         self._annotated_at = -math.inf
@@ -121,9 +121,7 @@ class StereoTipTracker(Component):
                 yield Publish(TIP, tip_message(tip, stamp_ns))
             yield Publish(TIP_POSE, tip_pose_message(tip, stamp_ns))
             yield from self._annotate(answer, at)
-            if answer.refused:
-                self._health.add_refused(answer.refused, at.steady)
-            self._health.add_pair(answer.arrival, at.steady, answer.measured)
+            self._health.add_pair(answer, at.steady)
             yield from self._report(at)
 
     # ---- inputs -------------------------------------------------------------------------------
@@ -133,7 +131,7 @@ class StereoTipTracker(Component):
         rows = []
         for side in SIDES:
             on_image, on_info = partial(self._on_image, side), partial(self._on_camera_info, side)
-            rows.append(Input(image_topic(side), m.Image, on_image, delivery))
+            rows.append(Input(f"stereo/{side}/image_raw", m.Image, on_image, delivery))
             rows.append(Input(f"stereo/{side}/camera_info", m.CameraInfo, on_info, delivery))
         return rows
 
@@ -167,19 +165,13 @@ class StereoTipTracker(Component):
             yield Publish(ANNOTATED, picture_message(picture, answer.pair.stamp))
 
     def _report(self, at: Moment) -> Actions:
-        answers, health = self.answers, self._health
-        health.update_unpaired(at.steady, answers.matcher)
-        yield from self._diagnose("track", health.track())
-        yield from self._diagnose("images", health.images(at.steady, answers))
-        yield from self._diagnose("joints", health.joints(answers))
-
-    def _diagnose(self, part: str, diagnostic: Diagnostic) -> Actions:
-        """Publish the diagnostics of a part; log it when it turns bad."""
-        yield Diagnose(part, diagnostic)
-        kind = diagnostic.message.partition(":")[0]
-        if kind != self._reported.get(part) and diagnostic.level >= Level.WARN:
-            yield Log("warning", f"{part}: {diagnostic.message}")
-        self._reported[part] = kind
+        """Publish the diagnostics of all parts; log a part when it turns bad."""
+        for part, diagnostic in self._health.parts(at.steady).items():
+            yield Diagnose(part, diagnostic)
+            kind = diagnostic.message.partition(":")[0]
+            if kind != self._reported.get(part) and diagnostic.level >= Level.WARN:
+                yield Log("warning", f"{part}: {diagnostic.message}")
+            self._reported[part] = kind
 
 
 def make_tracker(
@@ -196,8 +188,3 @@ def make_tracker(
     path = Path(settings.calibration_file or installed())
     text = read_calibration(path)
     return StereoTipTracker(settings, calibration_from(text, path), text, name)
-
-
-def image_topic(side: str) -> str:
-    """Return the relative topic of a camera's images."""
-    return f"stereo/{side}/image_raw"

@@ -186,25 +186,15 @@ class PairAnswers:
                     return
                 self.joints_silent = True
             self._queue.popleft()
-            answer = self._answer(arrival, pair)
-            yield answer
+            refused, insertion = self._refusal(pair), self.insertions.at(pair.stamp)
+            left, right = pair.left.pixels, pair.right.pixels
+            if refused or left is None or right is None:
+                yield Answer(pair, arrival, self.tracker.skip(refused), refused)
+                continue
+            measured = self.tracker.process(left, right, insertion)
+            yield Answer(pair, arrival, measured, refused)
             # The check for swapped images must not delay the answer.
-            self._check_swap(answer)
-
-    def _answer(self, arrival: float, pair: Pair[Frame]) -> Answer:
-        refused = self._refusal(pair)
-        left, right = pair.left.pixels, pair.right.pixels
-        if refused or left is None or right is None:
-            measured = self.tracker.skip(refused)
-        else:
-            measured = self.tracker.process(left, right, self.insertions.at(pair.stamp))
-        return Answer(pair, arrival, measured, refused)
-
-    def _check_swap(self, answer: Answer) -> None:
-        pair = answer.pair
-        left, right = pair.left.pixels, pair.right.pixels
-        if left is not None and right is not None and not answer.refused:
-            self.swap.update(left, right, self.insertions.at(pair.stamp), answer.measured)
+            self.swap.update(left, right, insertion, measured)
 
     def _refusal(self, pair: Pair[Frame]) -> str:
         """Return the reason for rejecting a pair; a long step back in time resets the tracker."""
