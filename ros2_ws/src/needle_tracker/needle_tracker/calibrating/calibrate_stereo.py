@@ -31,6 +31,7 @@ from needle_tracker.calibrating.calibration_start import PairsApartError, descri
 from needle_tracker.calibrating.charuco import CharucoBoard, save_figure, write_board
 from needle_tracker.calibrating.imported_lenses import read_lenses
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
+from needle_tracker.calibrating.rig_fit import rms_px
 from needle_tracker.calibrating.rig_model import LENS, SURFACE, unit_of
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, Window
 
@@ -129,12 +130,12 @@ def _run(options: Namespace) -> int:
 
 def reprojection_by_kind(result: RigCalibration) -> dict[tuple[str, str], float]:
     """Return the rms reprojection error by camera and kind of view, omitting absent kinds [px]."""
-    kinds = np.array([view.kind for view in result.model.views])
+    kind_of = np.array([view.kind for view in result.model.views])[result.model.view_of]
     return {
-        (side, kind): result.reprojection_rms_px(side, np.flatnonzero(kinds == kind))
+        (side, kind): rms_px(result.fit.residuals[chosen])
         for side in SIDES
         for kind in KINDS
-        if np.any(kinds[result.model.view_of[side]] == kind)
+        if np.any(chosen := result.model.seen_by[side] & (kind_of == kind))
     }
 
 
@@ -142,9 +143,10 @@ def report(result: RigCalibration, goal_mm: float) -> list[str]:
     """Return a calibration as lines of text."""
     kinds = [view.kind for view in result.model.views]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in KINDS)
+    left, right = (np.count_nonzero(result.model.seen_by[side]) for side in SIDES)
     lines = [
-        f"views: {counts}; corners: {len(result.model.pixels['left'])} left, "
-        f"{len(result.model.pixels['right'])} right, each to {result.fit.corner_sigma_px:.3f} px"
+        f"views: {counts}; corners: {left} left, {right} right, "
+        f"each to {result.fit.corner_sigma_px:.3f} px"
     ]
     for (side, kind), error in reprojection_by_kind(result).items():
         lines.append(f"reprojection error, {side} camera, {kind} boards: {error:.3f} px rms")

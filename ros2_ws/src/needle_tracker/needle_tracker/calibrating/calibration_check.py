@@ -22,6 +22,7 @@ from needle_tracker.calibrating.rig_fit import (
     board_parameters_free,
     fit,
     misfit_px,
+    rms_px,
 )
 from needle_tracker.calibrating.rig_model import (
     FIRST_WINDOW,
@@ -29,7 +30,7 @@ from needle_tracker.calibrating.rig_model import (
     RigModel,
     camera_slice,
     tip_error_p95,
-    tip_shifts,
+    tip_shift_p95,
     unit_of,
 )
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
@@ -134,8 +135,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     misfit = misfit_px(model, everything)
     covariance = everything.covariance[: model.shared, : model.shared]
     unseen = tip_error_p95(calibration, covariance)
-    asis = _fit(model, [], sigma).residuals.reshape(-1, 2)
-    reprojection = float(np.sqrt(np.mean(np.sum(asis**2, axis=-1))))
+    reprojection = rms_px(_fit(model, [], sigma).residuals)
     if not misfit <= EXPLAINED_PX:
         problem = _UNEXPLAINED.format(
             misfit, "another target or place than in the session, left and right exchanged"
@@ -144,7 +144,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     found = _causes(model, causes, sigma)
     best = _fit(model, found, sigma)
     deviations = [_deviation(model, best, cause) for cause in found]
-    shift = _p95(calibration, model.calibration(best.parameters))
+    shift = tip_shift_p95(calibration, model.calibration(best.parameters))
     problems = []
     if misfit > LARGEST_MISFIT_PX:
         problems.append(_UNEXPLAINED.format(misfit, "another lens setting, a target not flat"))
@@ -201,12 +201,8 @@ def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
     size = length if cause in CAMERAS else float(change[0])
     alone = model.start.copy()
     alone[columns] = best.parameters[columns]
-    error = _p95(model.calibration(model.start), model.calibration(alone))
+    error = tip_shift_p95(model.calibration(model.start), model.calibration(alone))
     return Deviation(cause, size, sigma, error)
-
-
-def _p95(assumed: StereoCalibration, true: StereoCalibration) -> float:
-    return float(np.percentile(np.linalg.norm(tip_shifts(assumed, true), axis=-1), 95.0))
 
 
 def report(result: CheckResult) -> str:

@@ -17,6 +17,7 @@ from needle_tracker.calibrating.rig_fit import (
     LARGEST_MISFIT_PX,
     misfit_px,
     place_deviations,
+    rms_px,
 )
 from needle_tracker.optics.calibration import SIDES
 
@@ -77,9 +78,10 @@ def misfits(result: RigCalibration) -> list[tuple[BoardView, str]]:
     result : RigCalibration
         The calibration.
     """
+    model, residuals = result.model, result.fit.residuals
     errors = [
-        (view, side, result.reprojection_rms_px(side, number))
-        for number, view in enumerate(result.model.views)
+        (view, side, rms_px(residuals[model.seen_by[side] & (model.view_of == number)]))
+        for number, view in enumerate(model.views)
         for side in SIDES
     ]
     typical = float(np.median([error for _, _, error in errors]))
@@ -107,9 +109,10 @@ def ring_patterns(result: RigCalibration) -> dict[str, float]:
     """
     found = {}
     for side, camera in result.calibration.cameras.items():
-        outwards = result.model.pixels[side] - camera.camera_matrix[:2, 2]
+        own = result.model.seen_by[side]
+        outwards = result.model.pixels[own] - camera.camera_matrix[:2, 2]
         radii = np.linalg.norm(outwards, axis=-1)
-        radial = np.sum(result.residuals(side) * outwards, axis=-1) / np.maximum(radii, 1.0)
+        radial = np.sum(result.fit.residuals[own] * outwards, axis=-1) / np.maximum(radii, 1.0)
         rings = np.array_split(radial[np.argsort(radii)], _RINGS)
         means = np.array([np.mean(ring) for ring in rings])
         errors = np.array([np.std(ring) / np.sqrt(len(ring)) for ring in rings])

@@ -374,6 +374,5 @@ def _misses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
     if any(view.under_surface for view in views):
         # With one flat board, index and height of the surface are indistinguishable.
         free[model.names.index("refractive_index")] = True
-    squares = np.sum(fit(model, model.start, free).residuals.reshape(-1, 2) ** 2, axis=-1)
-    of_view = np.concatenate([model.view_of[side] for side in SIDES])
-    return np.sqrt(np.bincount(of_view, squares) / np.bincount(of_view))
+    squares = np.sum(fit(model, model.start, free).residuals ** 2, axis=-1)
+    return np.sqrt(np.bincount(model.view_of, squares) / np.bincount(model.view_of))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import numpy.typing as npt
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
@@ -105,25 +104,6 @@ class RigCalibration:
     square_error: tuple[float, float]
     tip_error_p95: float
     apart: list[BoardView]
-
-    def reprojection_rms_px(self, side: str, views: npt.ArrayLike) -> float:
-        """Return the reprojection error of a camera over some views [px].
-
-        Parameters
-        ----------
-        side : str
-            "left" or "right".
-        views : int or array_like of int
-            Numbers of the views.
-        """
-        errors = self.residuals(side)[np.isin(self.model.view_of[side], views)]
-        return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else np.nan
-
-    def residuals(self, side: str) -> Array:
-        """Return measured minus fitted corners of one camera, shape (n, 2) [px]."""
-        count = 2 * len(self.model.pixels["left"])
-        part = self.fit.residuals[:count] if side == "left" else self.fit.residuals[count:]
-        return part.reshape(-1, 2)
 
 
 def calibrate(

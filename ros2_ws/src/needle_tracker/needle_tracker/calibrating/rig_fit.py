@@ -34,7 +34,7 @@ class RigFit:
         Fitted parameters.
     covariance : ndarray, shape (p, p)
         Covariance of the parameters; 0 for fixed ones.
-    residuals : ndarray, shape (2 * corners,)
+    residuals : ndarray, shape (n, 2)
         Measured minus fitted pixels [px].
     corner_sigma_px : float
         Standard deviation of the coordinate of a corner, from the residuals [px].
@@ -53,6 +53,11 @@ class RigFit:
     def sigma(self) -> Array:
         """Standard deviations of the parameters, 0 for fixed ones, shape (p,)."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+
+def rms_px(residuals: Array) -> float:
+    """Return the root mean square length of residuals, shape (n, 2) [px]; NaN without any."""
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1)))) if len(residuals) else np.nan
 
 
 def board_parameters_free(model: RigModel) -> Mask:
@@ -166,7 +171,7 @@ def _minimize(
     given = model.given_sigma[free] ** -2.0
 
     def cost_of(parameters: Array) -> tuple[float, Array]:
-        pixels = np.nan_to_num(model.residuals(parameters) / sigma, nan=1e4)
+        pixels = np.nan_to_num(model.residuals(parameters).ravel() / sigma, nan=1e4)
         robust = 2.0 * _OUTLIER**2 * (np.sqrt(1.0 + (pixels / _OUTLIER) ** 2) - 1.0)
         return float(0.5 * (robust.sum() + given @ parameters[free] ** 2)), pixels
 
