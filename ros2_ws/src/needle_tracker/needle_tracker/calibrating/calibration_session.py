@@ -319,7 +319,7 @@ def no_board_detected(view: BoardView) -> bool:
     return not np.any([len(view.corners(side).points) for side in SIDES])
 
 
-def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) -> BoardView:
+def averaged_view(name: str, session: Session, pairs: list[tuple[Image, Image]]) -> BoardView:
     """Return the view of a board at rest, from the mean of several exposures.
 
     Parameters
@@ -328,14 +328,13 @@ def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) ->
         Name of the view, by which the session gives the place of the board.
     session : Session
         Board and places.
-    pairs : list of dict of str to ndarray
+    pairs : list of (ndarray, ndarray)
         Left and right images.
     """
-    left, right = (
-        np.rint(np.mean([images[side] for images in pairs], axis=0)).astype(np.uint8)
-        for side in SIDES
+    means = (
+        np.rint(np.mean(images, axis=0)).astype(np.uint8) for images in zip(*pairs, strict=True)
     )
-    corners = (_corners_in(image, session.board) for image in (left, right))
+    corners = (_corners_in(image, session.board) for image in means)
     view = BoardView(name, session.place_of(name), *corners)
     if no_board_detected(view):
         raise _no_board(session)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -11,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Image
@@ -23,7 +20,7 @@ from needle_core.errors import UserError
 from needle_core.message_types import to_nanoseconds
 from needle_core.process.discovery import restrict_discovery
 from needle_core.process.shared_memory import remove_incomplete_ports
-from needle_core.ros.base_node import IMAGES_BEST_EFFORT, WholeNode
+from needle_core.ros.base_node import IMAGES_BEST_EFFORT, WholeNode, spin_until
 from needle_core.settings.bounds import check_bounds
 from needle_tracker.answers.tracker_messages import frame_of
 from needle_tracker.calibrating.calibration_check import check, figures, report
@@ -122,52 +119,39 @@ def _live_view(
     name = str(options.live)
     if session.place_of(name) is None:
         raise UserError(f"--live {name} is none of the session's places")
-    context = Context()
     restrict_discovery()
     remove_incomplete_ports()
-    rclpy.init(args=words, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        pairs = _live_pairs(context, calibration)
+        return averaged_view(name, session, _live_pairs(calibration))
     finally:
-        rclpy.try_shutdown(context=context)
-    return averaged_view(name, session, pairs)
+        rclpy.try_shutdown()
 
 
-def _live_pairs(context: Context, calibration: StereoCalibration) -> list[dict[str, np.ndarray]]:
+def _live_pairs(calibration: StereoCalibration) -> list[tuple[np.ndarray, np.ndarray]]:
     """Receive image pairs; raise a `UserError` for images of other cameras, or too few."""
-    node = WholeNode("check_calibration", context=context)
+    node = WholeNode("check_calibration")
     # The board is at rest: images of cameras without a trigger may be half a frame apart.
     matcher: PairMatcher[np.ndarray] = PairMatcher(None)
-    pairs: list[dict[str, np.ndarray]] = []
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
 
     def receive(side: str, message: Image) -> None:
         frame = frame_of(message, side, calibration.cameras[side])
         if frame.pixels is None:
             raise UserError(frame.problem)
         stamp_ns = to_nanoseconds(message.header.stamp)
-        pair = matcher.add(side, stamp_ns, frame.pixels.copy())
-        if pair is not None:
-            pairs.append({"left": pair.left, "right": pair.right})
+        if pair := matcher.add(side, stamp_ns, frame.pixels.copy()):
+            pairs.append((pair.left, pair.right))
 
     for side in SIDES:
         on_image = partial(receive, side)
         node.create_subscription(Image, f"stereo/{side}/image_raw", on_image, IMAGES_BEST_EFFORT)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    end = time.monotonic() + _TIMEOUT
-    try:
-        while len(pairs) < _LIVE_PAIRS:
-            left = end - time.monotonic()
-            if left <= 0.0:
-                raise UserError(
-                    f"{len(pairs)} image pairs of {_LIVE_PAIRS} in {_TIMEOUT:g} s on "
-                    f"stereo/{{left,right}}/image_raw (without a partner: "
-                    f"{matcher.unpaired.total()})"
-                )
-            executor.spin_once(timeout_sec=left)
-    finally:
-        executor.shutdown()
-        node.destroy_node()
+    spin_until(node, lambda: len(pairs) >= _LIVE_PAIRS, _TIMEOUT)
+    if len(pairs) < _LIVE_PAIRS:
+        raise UserError(
+            f"{len(pairs)} image pairs of {_LIVE_PAIRS} in {_TIMEOUT:g} s on "
+            f"stereo/{{left,right}}/image_raw (without a partner: {matcher.unpaired.total()})"
+        )
     return pairs
 
 

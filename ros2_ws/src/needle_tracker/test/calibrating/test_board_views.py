@@ -93,7 +93,7 @@ def test_a_board_at_rest_is_averaged_over_its_exposures() -> None:
     rng = np.random.default_rng(0)
     noise = rng.normal(0.0, 10.0, (10, *IMAGE.shape))
     exposures = np.clip(0.6 * IMAGE + 50.0 + noise, 0.0, 255.0).astype(np.uint8)
-    view = averaged_view("top", SESSION, [dict.fromkeys(SIDES, image) for image in exposures])
+    view = averaged_view("top", SESSION, [(image, image) for image in exposures])
     assert view.place is SESSION.places["top"]
     _, true = SMALL.find(IMAGE)
     one = SMALL.find(exposures[0])[1]
@@ -102,4 +102,4 @@ def test_a_board_at_rest_is_averaged_over_its_exposures() -> None:
         assert np.std(corners.pixels - true) < 0.5 * np.std(one - true)
     blank = np.full_like(IMAGE, 90)
     with pytest.raises(UserError, match="no image shows the session's board"):
-        averaged_view("top", SESSION, [dict.fromkeys(SIDES, blank)])
+        averaged_view("top", SESSION, [(blank, blank)])
