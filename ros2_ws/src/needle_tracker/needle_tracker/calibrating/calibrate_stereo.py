@@ -103,7 +103,7 @@ def _run(options: Namespace) -> int:
     options.output = output_file("--output", options.output)
     session = load_session(options.session)
     views, sizes = views_in_folders(options.left, options.right, session)
-    empty = [view.name for view in views if no_board_detected(view) and view.place is None]
+    empty = [view.name for view in views if no_board_detected(view) and view.kind == "free"]
     if empty:
         print(f"left out, no board found: {', '.join(empty)}")
     views = [view for view in views if view.name not in empty]
@@ -112,17 +112,15 @@ def _run(options: Namespace) -> int:
         result = calibrate(views, sizes, session.windows, lenses)
     except PairsApartError as error:
         print(f"NOT OK: {error}; nothing is written")
-        if options.json is not None:
-            write_json(options.json, {"problem": str(error)})
+        write_json(options.json, {"problem": str(error)})
         return EXIT_MISSED
     problems = contradictions(result)
     lines = [*report(result, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
     print("\n".join(lines))
     save_calibration(options.output, result.calibration, lines)
     save_figure(rig_figure(result), options.output.with_suffix(".rig.png"), 130)
-    if options.json is not None:
-        values = figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None}
-        write_json(options.json, values)
+    values = figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None}
+    write_json(options.json, values)
     print(f"written: {options.output}")
     good = not problems and 1e3 * result.tip_error_p95 <= options.goal_mm
     return EXIT_DONE if good else EXIT_MISSED
@@ -152,7 +150,7 @@ def report(result: RigCalibration, goal_mm: float) -> list[str]:
         lines.append(f"reprojection error, {side} camera, {kind} boards: {error:.3f} px rms")
     if result.apart:
         lines.append(f"WARNING: {describe_apart(result.apart)}; left out")
-    lines += [f"WARNING: {text}" for view, text in misfits(result) if view.place is None]
+    lines += [f"WARNING: {text}" for view, text in misfits(result) if view.kind == "free"]
     if "left.fx" not in result.parameters:
         lines.append("lenses: as given; their error adds to the tip error below")
     for name, found in result.parameters.items():

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +20,14 @@ from needle_tracker.calibrating.calibration_start import checked_view, initial_b
 from needle_tracker.calibrating.rig_fit import (
     LARGEST_MISFIT_PX,
     RigFit,
-    board_parameters_free,
     fit,
     misfit_px,
     rms_px,
 )
 from needle_tracker.calibrating.rig_model import (
     FIRST_WINDOW,
-    LENS,
+    POSE,
     RigModel,
-    camera_slice,
     tip_error_p95,
     tip_shift_p95,
     unit_of,
@@ -37,7 +36,8 @@ from needle_tracker.optics.calibration import SIDES, StereoCalibration
 
 Array = NDArray[np.float64]
 
-CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
+CAMERAS = {f"{side}_camera_turned": [f"{side}.{name}" for name in POSE[:3]] for side in SIDES}
+"""Parameters of a turned camera."""
 LEAST_IMPROVEMENT = 30.0  # decrease of chi-squared by one cause: far above noise
 EXPLAINED_PX = 1.0  # largest misfit that still counts as explained by the causes
 TURN_LIMIT = np.deg2rad(0.01)  # a camera with a larger rotation was touched
@@ -130,19 +130,18 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     views = [checked_view(view) for view in views]
     model = RigModel(calibration, views, initial_board_poses(calibration, views))
     causes = (*CAMERAS, *model.names[FIRST_WINDOW:])
-    everything = _fit(model, list(causes), None)
+    everything = fit(model, model.start, _parameters(causes))
     sigma = everything.corner_sigma_px
     misfit = misfit_px(model, everything)
-    covariance = everything.covariance[: model.shared, : model.shared]
-    unseen = tip_error_p95(calibration, covariance)
-    reprojection = rms_px(_fit(model, [], sigma).residuals)
+    unseen = tip_error_p95(calibration, everything.covariance)
+    reprojection = rms_px(fit(model, model.start, (), sigma).residuals)
     if not misfit <= EXPLAINED_PX:
         problem = _UNEXPLAINED.format(
             misfit, "another target or place than in the session, left and right exchanged"
         )
         return CheckResult(causes, [], np.nan, unseen, sigma, reprojection, [problem])
     found = _causes(model, causes, sigma)
-    best = _fit(model, found, sigma)
+    best = fit(model, model.start, _parameters(found), sigma)
     deviations = [_deviation(model, best, cause) for cause in found]
     shift = tip_shift_p95(calibration, model.calibration(best.parameters))
     problems = []
@@ -166,9 +165,13 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
 def _causes(model: RigModel, causes: tuple[str, ...], sigma: float) -> list[str]:
     """Return the fewest causes that explain the views, the most significant first."""
     found: list[str] = []
-    cost = _fit(model, found, sigma).cost
+    cost = fit(model, model.start, (), sigma).cost
     while len(found) < len(causes):
-        costs = {c: _fit(model, [*found, c], sigma).cost for c in causes if c not in found}
+        costs = {
+            cause: fit(model, model.start, _parameters([*found, cause]), sigma).cost
+            for cause in causes
+            if cause not in found
+        }
         best = min(costs, key=lambda cause: costs[cause])
         if 2.0 * (cost - costs[best]) < LEAST_IMPROVEMENT:
             break
@@ -177,23 +180,13 @@ def _causes(model: RigModel, causes: tuple[str, ...], sigma: float) -> list[str]
     return found
 
 
-def _fit(model: RigModel, causes: list[str], sigma: float | None) -> RigFit:
-    free = board_parameters_free(model)
-    for cause in causes:
-        free[_columns(model, cause)] = True
-    return fit(model, model.start, free, sigma)
-
-
-def _columns(model: RigModel, cause: str) -> list[int]:
-    """Return the parameter indices of a cause: rotation of a camera, or a window parameter."""
-    if cause in CAMERAS:
-        start = camera_slice(SIDES[CAMERAS.index(cause)]).start + len(LENS)
-        return [start, start + 1, start + 2]
-    return [model.names.index(cause)]
+def _parameters(causes: Iterable[str]) -> list[str]:
+    """Return the parameters of causes: rotations of cameras, and those of the windows."""
+    return [name for cause in causes for name in CAMERAS.get(cause, [cause])]
 
 
 def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
-    columns = _columns(model, cause)
+    columns = [model.names.index(name) for name in _parameters([cause])]
     change = (best.parameters - model.start)[columns]
     length = float(np.linalg.norm(change))
     towards = change / max(length, 1e-12)

@@ -38,8 +38,8 @@ def contradictions(result: RigCalibration) -> list[str]:
     result : RigCalibration
         The calibration.
     """
-    found = [text for view, text in misfits(result) if view.place is not None]
-    if any(view.place is not None for view in result.apart):
+    found = [text for view, text in misfits(result) if view.kind != "free"]
+    if any(view.kind != "free" for view in result.apart):
         found.insert(0, describe_apart(result.apart))
     cause = "its lens has more distortion than k1, k2, k3, p1 and p2 describe"
     if "left.fx" not in result.parameters:

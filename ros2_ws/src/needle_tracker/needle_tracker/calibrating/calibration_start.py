@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.calibration_session import BoardView, Corners, Place
-from needle_tracker.calibrating.rig_fit import board_parameters_free, fit
-from needle_tracker.calibrating.rig_model import LENS, RigModel, camera_slice
+from needle_tracker.calibrating.calibration_session import HELD_FREELY, BoardView, Corners, Place
+from needle_tracker.calibrating.rig_fit import fit
+from needle_tracker.calibrating.rig_model import POSE, RigModel
 from needle_tracker.optics.calibration import (
     LEAST_BASELINE,
     SIDES,
@@ -62,9 +62,9 @@ def checked_views(
     UserError
         Too few views or corners, a board that only one camera sees, or no board at a known place.
     """
-    checked = [checked_view(v, alone=surface is None and v.place is None) for v in views]
+    checked = [checked_view(v, alone=surface is None and v.kind == "free") for v in views]
     for side in SIDES:
-        free = [v for v in checked if v.place is None and len(v.corners(side).points)]
+        free = [v for v in checked if v.kind == "free" and len(v.corners(side).points)]
         if len(free) < least_free:
             raise UserError(
                 f"{len(free)} views of the board held freely in air"
@@ -101,8 +101,8 @@ def checked_view(view: BoardView, *, alone: bool = False) -> BoardView:
 
 def anchor_view(views: list[BoardView], surface: Window | None) -> BoardView | None:
     """Return the view that defines `rig`: preferably in air; with a common surface, only in air."""
-    known = [view for view in views if view.place and view.place.is_known]
-    in_air = [view for view in known if not view.under_surface]
+    known = [view for view in views if view.place.is_known]
+    in_air = [view for view in known if not view.place.under_surface]
     return next(iter(in_air if surface else in_air + known), None)
 
 
@@ -132,7 +132,7 @@ def calibrate_lenses(
     """
     cameras = []
     for side, window in zip(SIDES, windows, strict=True):
-        in_air = [view.corners(side) for view in views if not view.under_surface]
+        in_air = [view.corners(side) for view in views if not view.place.under_surface]
         lens = _lens([corners for corners in in_air if len(corners.points)], side, sizes[side])
         cameras.append(Camera(*sizes[side], *lens, np.eye(4), window))
     return StereoCalibration(*cameras)
@@ -171,7 +171,6 @@ def first_calibration(
     """
     anchor = anchor_view(views, cameras.surface)
     assert anchor is not None
-    assert anchor.place is not None
     placed: list[Camera] = []
     for side, alone in cameras.cameras.items():
         board = board_pose(alone, anchor.corners(side))
@@ -203,7 +202,7 @@ def initial_board_poses(calibration: StereoCalibration, views: list[BoardView]) 
     """
     boards = []
     for view in views:
-        if view.place is not None and view.place.is_known:
+        if view.place.is_known:
             boards.append(view.place.T_rig_board)
             continue
         side = next(side for side in SIDES if len(view.corners(side).points))
@@ -308,14 +307,18 @@ def describe_apart(views: list[BoardView]) -> str:
 
 def _apart(views: list[BoardView], cameras: StereoCalibration) -> tuple[list[str], Array | None]:
     both = [view for view in views if all(len(view.corners(side).points) for side in SIDES)]
-    in_air = [dataclasses.replace(view, place=None) for view in both if not view.under_surface]
+    in_air = [
+        dataclasses.replace(view, place=HELD_FREELY)
+        for view in both
+        if not view.place.under_surface
+    ]
     if not in_air:
         return [], None
     apart, pose = _apart_in_air(cameras, in_air)
     kept = [view for view in views if view.name not in apart]
     if cameras.surface is not None and anchor_view(kept, cameras.surface) is not None:
         calibration, _ = first_calibration(kept, _posed(cameras, pose))
-        for view in (view for view in both if view.under_surface):
+        for view in (view for view in both if view.place.under_surface):
             alike = [dataclasses.replace(view, place=Place(np.eye(4), True, np.inf))]
             if _misses(calibration, alike) > 2.0 * _alone(calibration, alike) + _SLACK_UNDER_PX:
                 apart.append(view.name)
@@ -342,9 +345,8 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
     for _ in range(_ROUNDS):
         kept = [view for view, is_near in zip(views, near, strict=True) if is_near]
         model = RigModel(_posed(cameras, pose), kept, left[near])
-        free = board_parameters_free(model)
-        free[camera_slice("right")][len(LENS) :] = True
-        parameters = fit(model, model.start, free).parameters
+        names = [f"right.{name}" for name in POSE]
+        parameters = fit(model, model.start, names).parameters
         pose = model.calibration(parameters).right.T_optical_rig
         was, near = near, _misses(_posed(cameras, pose), views) <= limits
         if np.array_equal(near, was) or not np.any(near):
@@ -370,9 +372,7 @@ def _alone(calibration: StereoCalibration, views: list[BoardView]) -> Array:
 def _misses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
     """Return the rms corner error of each view at the best-fitting pose of the board [px]."""
     model = RigModel(calibration, views, initial_board_poses(calibration, views))
-    free = board_parameters_free(model)
-    if any(view.under_surface for view in views):
-        # With one flat board, index and height of the surface are indistinguishable.
-        free[model.names.index("refractive_index")] = True
-    squares = np.sum(fit(model, model.start, free).residuals ** 2, axis=-1)
+    # With one flat board, index and height of the surface are indistinguishable.
+    names = ["refractive_index"] if any(view.place.under_surface for view in views) else []
+    squares = np.sum(fit(model, model.start, names).residuals ** 2, axis=-1)
     return np.sqrt(np.bincount(model.view_of, squares) / np.bincount(model.view_of))

@@ -125,7 +125,7 @@ class RigModel:
         numbers = np.arange(len(corners)).repeat([len(one.points) for one in corners])
         side_of, self.view_of = np.divmod(numbers, len(views))
         self.seen_by = {side: side_of == number for number, side in enumerate(SIDES)}
-        self._under = np.array([view.under_surface for view in views])[self.view_of]
+        self._under = np.array([view.place.under_surface for view in views])[self.view_of]
         self.start = np.zeros(self.shared + 6 * len(views))
         for side in SIDES:
             camera = start.cameras[side]
@@ -242,7 +242,7 @@ def _in_air(camera: Camera) -> Camera:
 
 def _place_sigma(view: BoardView) -> Array:
     """Return the standard deviations of the place of a board, shape (6,) [rad, m]."""
-    if view.place is None or not view.place.is_known:
+    if not view.place.is_known:
         return np.full(6, np.inf)
     # The sigma of the rotation follows from that of the board's edges.
     reach = max(float(np.ptp(view.left.points[:, :2], axis=0).max()), 1e-3)
@@ -312,16 +312,17 @@ def tip_error_p95(
     ----------
     calibration : StereoCalibration
         The calibration.
-    covariance : ndarray, shape (s, s)
-        Covariance of the parameters that all views share (`RigModel.names`).
+    covariance : ndarray, shape (p, p)
+        Covariance of the parameters; only those count that all views share (`RigModel.names`).
     tied : bool
         Whether the relative pose of the cameras is fixed.
     """
-    generator = np.random.default_rng(_SEED)
-    values, vectors = np.linalg.eigh(covariance)
+    generator, slopes = np.random.default_rng(_SEED), _tip_slopes(calibration, tied=tied)
+    shared = slopes.shape[-1]
+    values, vectors = np.linalg.eigh(covariance[:shared, :shared])
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    draws = generator.standard_normal((_DRAWS, len(covariance))) @ root.T
-    shifts = np.einsum("nij,dj->dni", _tip_slopes(calibration, tied=tied), draws)
+    draws = generator.standard_normal((_DRAWS, shared)) @ root.T
+    shifts = np.einsum("nij,dj->dni", slopes, draws)
     return float(np.percentile(np.linalg.norm(shifts, axis=-1), 95.0))
 
 

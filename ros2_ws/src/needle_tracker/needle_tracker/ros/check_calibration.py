@@ -25,6 +25,7 @@ from needle_core.settings.bounds import check_bounds
 from needle_tracker.answers.tracker_messages import frame_of
 from needle_tracker.calibrating.calibration_check import check, figures, report
 from needle_tracker.calibrating.calibration_session import (
+    HELD_FREELY,
     BoardView,
     Session,
     averaged_view,
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse(arguments: Sequence[str]) -> Namespace:
-    """Return the options of a command line, without the name of the program; `limit` is in metres.
+    """Return the options of a command line, without the name of the program.
 
     Raises
     ------
@@ -77,7 +78,6 @@ def parse(arguments: Sequence[str]) -> Namespace:
     if len({given.left is None, given.right is None, given.live is not None}) > 1:
         raise UserError("give either --left and --right, or --live; see --help")
     check_bounds("--limit-mm", given.limit_mm, 0.001, 10.0, "mm")
-    given.limit = 1e-3 * given.limit_mm
     return given
 
 
@@ -102,14 +102,13 @@ def check_calibration(options: Namespace, words: list[str]) -> int:
         for side, expected in calibration.sizes.items():
             if problem := size_problem(side, sizes[side], expected):
                 raise UserError(problem)
-        if free := [view.name for view in views if view.place is None]:
+        if free := [view.name for view in views if view.kind == "free"]:
             print(f"held freely in air, as the session has no such place: {', '.join(free)}")
     else:
         views = [_live_view(options, calibration, session, words)]
-    result = check(calibration, views, options.limit)
+    result = check(calibration, views, 1e-3 * options.limit_mm)
     print(report(result))
-    if options.json is not None:
-        write_json(options.json, figures(result))
+    write_json(options.json, figures(result))
     return EXIT_DONE if result.ok else EXIT_MISSED
 
 
@@ -117,7 +116,7 @@ def _live_view(
     options: Namespace, calibration: StereoCalibration, session: Session, words: list[str]
 ) -> BoardView:
     name = str(options.live)
-    if session.place_of(name) is None:
+    if session.place_of(name) is HELD_FREELY:
         raise UserError(f"--live {name} is none of the session's places")
     restrict_discovery()
     remove_incomplete_ports()

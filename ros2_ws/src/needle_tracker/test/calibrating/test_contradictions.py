@@ -13,7 +13,7 @@ from needle_tracker.calibrating.calibration_outliers import (
     contradictions,
     ring_patterns,
 )
-from needle_tracker.calibrating.calibration_session import BoardView, Corners
+from needle_tracker.calibrating.calibration_session import HELD_FREELY, BoardView, Corners
 from needle_tracker.calibrating.calibration_start import PairsApartError, consistent_views
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.optics.calibration import StereoCalibration
@@ -65,7 +65,6 @@ def test_a_wrong_place_is_found(
 ) -> None:
     number = next(i for i, view in enumerate(views) if view.name == name)
     place = views[number].place
-    assert place is not None
     pose = place.T_rig_board.copy()
     pose[:3, 3] += shift
     wrong = dataclasses.replace(views[number], place=dataclasses.replace(place, T_rig_board=pose))
@@ -111,7 +110,7 @@ def moved(rig: StereoRig, views: list[BoardView], numbers: set[int]) -> list[Boa
         pose, step = free_pose(rng), np.random.default_rng(number).normal(size=3)
         pose[:3, 3] += 0.3e-3 * step / np.linalg.norm(step)
         if number in numbers:
-            right = view_of(rig, "", pose, None, np.random.default_rng(number)).right
+            right = view_of(rig, "", pose, HELD_FREELY, np.random.default_rng(number)).right
             result[number] = dataclasses.replace(views[number], right=right)
     return result
 
