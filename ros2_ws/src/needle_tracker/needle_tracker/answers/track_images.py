@@ -31,6 +31,7 @@ from needle_tracker.sources.image_files import (
     NamedPair,
     PairSequence,
     Sizes,
+    listed,
     open_pairs,
     progress,
 )
@@ -83,7 +84,6 @@ COLUMNS = (
     *("left_end", "left_shaft", "right_end", "right_shaft", "missing"),
 )
 _NODE = "stereo_tracker"
-_NAMED = 5  # names listed in a warning; the others are only counted
 _NEW_RUN = 10e-3  # change of the insertion between two images that begins a new run [m]
 
 
@@ -136,26 +136,24 @@ def _run(given: argparse.Namespace) -> int:
         print(f"drawn: {overlays}")
     warnings = {
         f"{SUSPICION}; exchange --left and --right": swap.suspected,
-        f"{len(pairs.unpaired)} images without a partner: {_named(pairs.unpaired)}": pairs.unpaired,
-        f"{len(unusable)} pairs cannot be used: {_named(unusable)}": unusable,
-        f"{pairs.cut_off} pairs listed in the videos cannot be read": pairs.cut_off,
+        pairs.missing: pairs.missing,
+        f"{len(unusable)} pairs cannot be used: {listed(unusable)}": unusable,
         f"{without} pairs have no insertion": given.insertion and without,
     }
     for warning, holds in warnings.items():
         if holds:
             _warn(warning)
-    if json is not None:
-        result: dict[str, JsonValue] = {
-            "pairs": len(rows),
-            "tips": found,
-            "unpaired": len(pairs.unpaired),
-            "unreadable": len(unusable),
-            "without_insertion": without,
-            **detected.figures(),
-            "wall_s": time.perf_counter() - begin,
-            **(truth.figures() if given.truth else dict.fromkeys(truth.figures())),
-        }
-        write_json(json, result)
+    result: dict[str, JsonValue] = {
+        "pairs": len(rows),
+        "tips": found,
+        "unpaired": len(pairs.unpaired),
+        "unreadable": len(unusable),
+        "without_insertion": without,
+        **detected.figures(),
+        "wall_s": time.perf_counter() - begin,
+        **(truth.figures() if given.truth else dict.fromkeys(truth.figures())),
+    }
+    write_json(json, result)
     return EXIT_DONE
 
 
@@ -233,11 +231,6 @@ def _new_folder(name: str, text: str) -> Path:
     except OSError as error:
         raise UserError(f"{name} {folder}: {error.strerror}") from error
     return folder
-
-
-def _named(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
 
 
 def _warn(what: str) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ _CAMERA_NUMBER = "(?:(?<=cam)|(?<=cam[-_])|(?<=camera)|(?<=camera[-_]))%d(?!\\d)
 _WORDS = (("left", "right"), (_CAMERA_NUMBER % 0, "1"), (_CAMERA_NUMBER % 1, "2"), ("l", "r"))
 _SEPARATORS = "-_. "
 _SIDES = ("left", "right")
+_LISTED = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,8 +94,6 @@ class PairSequence:
         Names of the pairs, in natural order; for videos as many as the containers declare.
     unpaired : list of str
         Names without a partner, with their side; for videos, complete only at the end.
-    cut_off : int
-        Number of pairs that the containers declare but the data lack; valid only at the end.
     """
 
     names: list[str]
@@ -102,22 +101,22 @@ class PairSequence:
     _left: Path
     _right: Path
     _files: list[tuple[str, str]] | None
-    cut_off: int = 0
+    _cut_off: int = 0  # pairs that the containers declare but the data lack
 
     def refuse_unpaired(self) -> PairSequence:
         """Return the sequence itself; raises a `UserError` if an image has no partner."""
         if self.unpaired:
-            raise UserError(f"images without a partner ({len(self.unpaired)}): {self.unpaired[0]}")
+            raise UserError(self.missing)
         return self
 
     @property
     def missing(self) -> str:
-        """Missing frames of the videos, as text, valid only at the end; empty if complete."""
+        """Missing images as text; for videos, complete only at the end; empty if complete."""
         parts = []
         if self.unpaired:
-            parts.append(f"{len(self.unpaired)} frames without a partner")
-        if self.cut_off:
-            parts.append(f"{self.cut_off} of {len(self.names)} pairs cannot be read: cut off?")
+            parts.append(f"{len(self.unpaired)} images without a partner: {listed(self.unpaired)}")
+        if self._cut_off:
+            parts.append(f"{self._cut_off} of {len(self.names)} pairs cannot be read: cut off?")
         return ", ".join(parts)
 
     def __iter__(self) -> Iterator[NamedPair]:
@@ -143,7 +142,7 @@ class PairSequence:
             while frame is not None:
                 self.unpaired.append(f"{side} {unpaired:06d}")
                 unpaired, frame = unpaired + 1, grey_frame(*video.read())
-        self.cut_off = max(len(self.names) - index, 0)
+        self._cut_off = max(len(self.names) - index, 0)
 
 
 def open_pairs(left: Path, right: Path) -> PairSequence:
@@ -194,6 +193,12 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
         for name in sorted(names - used, key=_natural)
     ]
     return PairSequence([name for name, *_ in pairs], unpaired, left, right, files)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return some names as text; of many, only the number of the others."""
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more
 
 
 def progress(pairs: PairSequence, what: str) -> Iterator[NamedPair]:

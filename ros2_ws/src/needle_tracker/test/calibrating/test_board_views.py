@@ -11,6 +11,7 @@ import pytest
 
 from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import (
+    HELD_FREELY,
     Place,
     Session,
     averaged_view,
@@ -39,7 +40,7 @@ def test_each_pair_of_images_is_a_view(folder: Path) -> None:
     assert sizes == dict.fromkeys(SIDES, IMAGE.shape[::-1])
     assert [view.name for view in views] == ["free_1", "top"]
     free, top = views
-    assert (free.place, top.place) == (None, SESSION.places["top"])
+    assert (free.place, top.place) == (HELD_FREELY, SESSION.places["top"])
     assert len(free.right.points) == 0
     for corners in (top.left, top.right, free.left):
         np.testing.assert_allclose(corners.points, SMALL.corners)
@@ -74,7 +75,7 @@ def another_board(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "cause"),
     [
-        (drop("left/free_1.png"), r"without a partner \(1\): right free_1.png"),
+        (drop("left/free_1.png"), "1 images without a partner: right free_1.png"),
         (write("right/top.png", np.zeros((48, 64), np.uint8)), "top.png is 64x48"),
         (broken, "cannot read .*top.png"),
         (no_image_of_the_place, "places.top has no image"),
