@@ -181,7 +181,7 @@ class PairAnswers:
                 self.unanswered += 1
                 self._queue.popleft()
                 continue
-            if not (self.joints_silent or self.insertions.is_bracketed(pair.stamp)):
+            if not self.joints_silent and self.insertions.latest < pair.stamp:
                 if now - arrival < self._joint_timeout:
                     return
                 self.joints_silent = True
