@@ -7,7 +7,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -30,7 +29,6 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.files.installed import find_shared_file
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration, load_calibration
 from needle_tracker.sources.stereo_source import (
@@ -74,8 +72,7 @@ class StereoCameraParameters:
 
     def calibration(self) -> StereoCalibration:
         """Return the calibration of the cameras, the installed one by default."""
-        installed = "needle_tracker", "config/calibration.yaml"
-        return load_calibration(Path(self.calibration_file or find_shared_file(*installed)))
+        return load_calibration(self.calibration_file)
 
 
 class StereoCamera(Component):

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
+from needle_core.files.installed import find_shared_file
 from needle_core.files.yaml_files import load_yaml, read_calibration
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 
@@ -176,14 +177,14 @@ class StereoCalibration:
         return common_surface(self.left.window, self.right.window)
 
 
-def load_calibration(path: Path) -> StereoCalibration:
+def load_calibration(file: str | Path) -> StereoCalibration:
     """Read and check a calibration file.
 
     Parameters
     ----------
-    path : Path
+    file : str or Path
         YAML file in the format of docs/calibration.md: `left` and `right`; `phantom`, or a `window`
-        under each of them.
+        under each of them. An empty text stands for the simulated bench's.
 
     Returns
     -------
@@ -195,6 +196,7 @@ def load_calibration(path: Path) -> StereoCalibration:
     UserError
         Unreadable, not YAML, or a value missing, not finite, of the wrong size or out of bounds.
     """
+    path = Path(file or find_shared_file("needle_tracker", "config/calibration.yaml")).expanduser()
     return calibration_from(read_calibration(path), path)
 
 
