@@ -70,10 +70,6 @@ class StereoCameraParameters:
         """Check the fields."""
         check_fields(self)
 
-    def calibration(self) -> StereoCalibration:
-        """Return the calibration of the cameras, the installed one by default."""
-        return load_calibration(self.calibration_file)
-
 
 class StereoCamera(Component):
     """Requests a pair at each tick, and publishes the received pairs.
@@ -195,7 +191,7 @@ def make_camera(settings: StereoCameraParameters, name: str = StereoCamera.name)
     UserError
         A bad calibration file.
     """
-    return StereoCamera(settings, settings.calibration(), name)
+    return StereoCamera(settings, load_calibration(settings.calibration_file), name)
 
 
 def open_pairs(settings: StereoCameraParameters) -> PairPort:
@@ -206,7 +202,8 @@ def open_pairs(settings: StereoCameraParameters) -> PairPort:
     UserError
         A bad source.
     """
-    names, sizes = (settings.left, settings.right), settings.calibration().sizes
+    sizes = load_calibration(settings.calibration_file).sizes
+    names = settings.left, settings.right
     return PairPort(open_source(names, sizes, settings.rate, time.time_ns, loop=settings.loop))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import partial
-from pathlib import Path
 
 from needle_core import messages as m
 from needle_core.component import (
@@ -25,8 +24,6 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Level
-from needle_core.files.installed import find_shared_file
-from needle_core.files.yaml_files import read_calibration
 from needle_tracker.answers.annotation import annotate
 from needle_tracker.answers.health import Health
 from needle_tracker.answers.pair_answers import Answer, PairAnswers
@@ -39,7 +36,7 @@ from needle_tracker.answers.tracker_messages import (
     tip_pose_message,
 )
 from needle_tracker.filter.measurement import TrackState
-from needle_tracker.optics.calibration import SIDES, StereoCalibration, calibration_from
+from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 TIP, TIP_POSE = "needle/tip", "needle/tip_pose"
@@ -55,9 +52,7 @@ class StereoTipTracker(Component):
     settings : StereoTrackerParameters
         Parameters of the node.
     calibration : StereoCalibration
-        The stereo rig.
-    calibration_text : str
-        Text of its file, which is published for recorders.
+        The stereo rig; the text of its file is published for recorders.
     name : str
         Full name of the node.
 
@@ -72,16 +67,12 @@ class StereoTipTracker(Component):
     name = "stereo_tracker"
 
     def __init__(
-        self,
-        settings: StereoTrackerParameters,
-        calibration: StereoCalibration,
-        calibration_text: str = "",
-        name: str = name,
+        self, settings: StereoTrackerParameters, calibration: StereoCalibration, name: str = name
     ) -> None:
         self.name, self.settings = name, settings
         self.has_annotation_subscriber = False
         self._cameras = calibration.cameras
-        self._calibration_text = calibration_text
+        self._calibration_text = calibration.text
         self._is_calibration_published = False
         self.answers = PairAnswers(calibration, settings)
         self._health = Health(self.answers)
@@ -184,7 +175,4 @@ def make_tracker(
     UserError
         A bad calibration file.
     """
-    installed = partial(find_shared_file, "needle_tracker", "config/calibration.yaml")
-    path = Path(settings.calibration_file or installed())
-    text = read_calibration(path)
-    return StereoTipTracker(settings, calibration_from(text, path), text, name)
+    return StereoTipTracker(settings, load_calibration(settings.calibration_file), name)

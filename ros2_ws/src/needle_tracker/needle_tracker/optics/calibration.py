@@ -156,10 +156,11 @@ class Camera:
 
 @dataclasses.dataclass(frozen=True)
 class StereoCalibration:
-    """Both cameras, each with its window."""
+    """Both cameras, each with its window; `text` is that of its file, if it has one."""
 
     left: Camera
     right: Camera
+    text: str = dataclasses.field(default="", kw_only=True)
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -203,7 +204,7 @@ def load_calibration(file: str | Path) -> StereoCalibration:
 def calibration_from(text: str, path: Path) -> StereoCalibration:
     """Return the calibration in the text of a file; raises as `load_calibration`."""
     try:
-        return parse_calibration(load_yaml(text))
+        return dataclasses.replace(parse_calibration(load_yaml(text)), text=text)
     except (UserError, ValueError) as error:
         raise UserError(f"calibration {path}: {error}") from error
 
@@ -220,13 +221,6 @@ def parse_calibration(content: Any) -> StereoCalibration:
         _camera(content, side, window)
         for side, window in zip(SIDES, parse_windows(content), strict=True)
     )
-    for side, camera in zip(SIDES, (left, right), strict=True):
-        height = float(camera.window.height(camera.centre))
-        if height <= 0.0:
-            raise UserError(
-                f"{side} camera is not above the surface that it looks through, but "
-                f"{-1e3 * height:.1f} mm beneath: the window's normal must point to the camera"
-            )
     if np.linalg.norm(left.centre - right.centre) < LEAST_BASELINE:
         raise UserError("left and right camera are in the same place: no depth can be measured")
     return StereoCalibration(left, right)
@@ -304,7 +298,14 @@ def _camera(content: Any, side: str, window: Window) -> Camera:
         raise UserError(f"{side}.distortion_model = {model!r}, expected {_DISTORTION_MODEL!r}")
     distortion = numbers(content, 5, side, "distortion_coefficients", "data")
     transform = transform_of(content, side, "T_optical_rig")
-    return Camera(width, height, matrix, distortion, transform, window)
+    camera = Camera(width, height, matrix, distortion, transform, window)
+    above = float(window.height(camera.centre))
+    if above <= 0.0:
+        raise UserError(
+            f"{side} camera is not above the surface that it looks through, but "
+            f"{-1e3 * above:.1f} mm beneath: the window's normal must point to the camera"
+        )
+    return camera
 
 
 def transform_of(content: Any, *keys: str) -> NDArray[np.float64]:
