@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -18,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
-from needle_core.files.file_access import write_text
+from needle_core.files.yaml_files import write_yaml
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.calibrating.calibration_outliers import contradictions, misfits
 from needle_tracker.calibrating.calibration_session import (
@@ -256,8 +255,7 @@ def save_calibration(path: Path, calibration: StereoCalibration, comments: list[
                 "layers": [dataclasses.asdict(layer) for layer in window.layers],
                 "inside": float(window.inside),
             }
-    text = yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120)
-    write_text(path, "".join(f"# {line}\n" for line in comments) + text)
+    write_yaml(path, content, comments)
 
 
 def rig_figure(result: RigCalibration) -> Figure:
