@@ -18,7 +18,7 @@ from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_js
 from needle_core.commands.csv_files import read_insertions, read_lengths
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
-from needle_core.files.file_access import write_text
+from needle_core.files.file_access import make_folder, write_text
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import missing_section_warning, read_sections, values_for
 from needle_tracker.answers.annotation import annotate, missing
@@ -101,7 +101,9 @@ def _run(given: argparse.Namespace) -> int:
     pairs = open_pairs(Path(given.left), Path(given.right))
     true = read_lengths(Path(given.truth), ("x_m", "y_m", "z_m")) if given.truth else {}
     truth = TruthComparison(true)
-    overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
+    overlays = None if given.overlay is None else Path(given.overlay).expanduser()
+    if overlays is not None:
+        make_folder(overlays)
     tracker = NeedleTracker(calibration, parameters, parameters.reference(calibration.sizes))
     tracker.warm_up()
     begin = time.perf_counter()
@@ -219,18 +221,6 @@ def to_row(name: str, measured: Measurement) -> list[str]:
     for end in measured.ends:
         shown += ["", ""] if end is None else [f"{end.ends:.2f}", f"{end.shaft:.2f}"]
     return [name, "0" if cause else "1", *measured_fields, *shown, cause]
-
-
-def _new_folder(name: str, text: str) -> Path:
-    """Create a folder, or accept an empty one; return its path."""
-    folder = Path(text).expanduser()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise UserError(f"{name} {folder}: is not empty; give a new folder")
-    except OSError as error:
-        raise UserError(f"{name} {folder}: {error.strerror}") from error
-    return folder
 
 
 def _warn(what: str) -> None:
