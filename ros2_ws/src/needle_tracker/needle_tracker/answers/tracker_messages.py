@@ -13,11 +13,10 @@ from needle_core.messages import (
     Image,
     JointState,
     Point,
-    Pose,
     PoseWithCovariance,
 )
 from needle_tracker.answers.pair_answers import CameraInfoProblem
-from needle_tracker.optics.calibration import Camera, rotation_matrix
+from needle_tracker.optics.calibration import Camera
 from needle_tracker.sources.image_encodings import Frame, decoded
 from needle_tracker.sources.image_files import size_problem
 from needle_tracker.stereo.triangulation import SpatialTip
@@ -87,13 +86,6 @@ def tip_pose_message(tip: SpatialTip | None, stamp_ns: int) -> PoseWithCovarianc
         covariance[3:, 3:] = rotation_covariance(tip.direction, tip.direction_covariance)
     values = tuple(covariance.ravel().tolist())
     return PoseWithCovariance(stamp_ns, RIG_FRAME, position, quaternion, values)
-
-
-def rotation_of(pose: Pose | PoseWithCovariance) -> NDArray[np.float64] | None:
-    """Return the rotation matrix of a pose, (3, 3); None if it has no orientation."""
-    quaternion = np.array(pose.orientation)
-    norm = float(np.linalg.norm(quaternion))
-    return rotation_matrix(quaternion / norm) if 0.5 < norm < 2.0 else None
 
 
 def picture_message(pixels: NDArray[np.uint8], stamp_ns: int) -> Image:
