@@ -63,7 +63,7 @@ _LIVE_PAIRS, _TIMEOUT = 10, 10.0  # pairs that are averaged, and the wait for th
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     words = list(sys.argv if arguments is None else ["check_calibration", *arguments])
-    return run_command(lambda: check_calibration(parse(remove_ros_args(words)[1:]), words))
+    return run_command(lambda: check_calibration(parse(remove_ros_args(words)[1:])))
 
 
 def parse(arguments: Sequence[str]) -> Namespace:
@@ -74,14 +74,6 @@ def parse(arguments: Sequence[str]) -> Namespace:
     UserError
         Contradictory options, or a number out of bounds.
     """
-    given = _parser().parse_args(arguments)
-    if len({given.left is None, given.right is None, given.live is not None}) > 1:
-        raise UserError("give either --left and --right, or --live; see --help")
-    check_bounds("--limit-mm", given.limit_mm, 0.001, 10.0, "mm")
-    return given
-
-
-def _parser() -> CommandParser:
     parser = CommandParser("check_calibration", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
     add("--calibration", type=Path, required=True, metavar="FILE", help="calibration to check")
@@ -91,10 +83,14 @@ def _parser() -> CommandParser:
     add("--live", metavar="NAME", help="use images from topics, the board at this place")
     add("--limit-mm", type=float, default=0.15, metavar="MM", help="accepted tip error (0.15)")
     add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")
-    return parser
+    given = parser.parse_args(arguments)
+    if len({given.left is None, given.right is None, given.live is not None}) > 1:
+        raise UserError("give either --left and --right, or --live; see --help")
+    check_bounds("--limit-mm", given.limit_mm, 0.001, 10.0, "mm")
+    return given
 
 
-def check_calibration(options: Namespace, words: list[str]) -> int:
+def check_calibration(options: Namespace) -> int:
     """Check the calibration, print and write the result."""
     calibration, session = load_calibration(options.calibration), load_session(options.session)
     if options.left is not None and options.right is not None:
@@ -105,22 +101,19 @@ def check_calibration(options: Namespace, words: list[str]) -> int:
         if free := [view.name for view in views if view.kind == "free"]:
             print(f"held freely in air, as the session has no such place: {', '.join(free)}")
     else:
-        views = [_live_view(options, calibration, session, words)]
+        views = [_live_view(str(options.live), calibration, session)]
     result = check(calibration, views, 1e-3 * options.limit_mm)
     print(report(result))
     write_json(options.json, figures(result))
     return EXIT_DONE if result.ok else EXIT_MISSED
 
 
-def _live_view(
-    options: Namespace, calibration: StereoCalibration, session: Session, words: list[str]
-) -> BoardView:
-    name = str(options.live)
+def _live_view(name: str, calibration: StereoCalibration, session: Session) -> BoardView:
     if session.place_of(name) is HELD_FREELY:
         raise UserError(f"--live {name} is none of the session's places")
     restrict_discovery()
     remove_incomplete_ports()
-    rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         return averaged_view(name, session, _live_pairs(calibration))
     finally:
