@@ -118,7 +118,8 @@ def held(turn: Rotation, up: Array, middle: Array, board: CharucoBoard = BOARD) 
     pose = np.eye(4)
     z = np.array([0.0, 0.0, 1.0])
     pose[:3, :3] = turn.as_matrix() @ np.stack([z, np.cross(-up, z), -up], axis=-1)
-    pose[:3, 3] = middle - pose[:3, :3] @ [*(0.5 * np.array(board.size)), 0.0]
+    half = 0.5 * board.square * np.array([board.columns, board.rows, 0.0])
+    pose[:3, 3] = middle - pose[:3, :3] @ half
     return pose
 
 

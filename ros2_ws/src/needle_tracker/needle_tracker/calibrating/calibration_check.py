@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from needle_core.commands.cli import JsonValue
 from needle_tracker.calibrating.calibration_session import BoardView
-from needle_tracker.calibrating.calibration_start import checked_view, initial_board_poses
+from needle_tracker.calibrating.calibration_start import checked_view
 from needle_tracker.calibrating.rig_fit import (
     LARGEST_MISFIT_PX,
     RigFit,
@@ -128,7 +128,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
         A target that one camera does not detect, or that has no known place.
     """
     views = [checked_view(view) for view in views]
-    model = RigModel(calibration, views, initial_board_poses(calibration, views))
+    model = RigModel(calibration, views)
     causes = (*CAMERAS, *model.names[FIRST_WINDOW:])
     everything = fit(model, model.start, _parameters(causes))
     sigma = everything.corner_sigma_px

@@ -13,12 +13,7 @@ from numpy.typing import NDArray
 from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.calibration_start import describe_apart
 from needle_tracker.calibrating.rig_calibration import RigCalibration
-from needle_tracker.calibrating.rig_fit import (
-    LARGEST_MISFIT_PX,
-    misfit_px,
-    place_deviations,
-    rms_px,
-)
+from needle_tracker.calibrating.rig_fit import LARGEST_MISFIT_PX, misfit_px, rms_px
 from needle_tracker.optics.calibration import SIDES
 
 Array = NDArray[np.float64]
@@ -61,7 +56,7 @@ def contradictions(result: RigCalibration) -> list[str]:
             f"{'larger' if error > 0.0 else 'smaller'} than in the session (tip errors scale with "
             "it): measure them again, and the places in air"
         )
-    for name, distance, pull in place_deviations(result.model, result.fit):
+    for name, distance, pull in _place_deviations(result):
         if pull > LARGEST_PULL:
             found.append(
                 f"{name} is {1e3 * distance:.2f} mm ({pull:.0f} standard deviations) from "
@@ -84,7 +79,8 @@ def misfits(result: RigCalibration) -> list[tuple[BoardView, str]]:
         for number, view in enumerate(model.views)
         for side in SIDES
     ]
-    typical = float(np.median([error for _, _, error in errors]))
+    # A camera that does not see a board has no error.
+    typical = float(np.nanmedian([error for _, _, error in errors]))
     return [
         (
             view,
@@ -119,3 +115,22 @@ def ring_patterns(result: RigCalibration) -> dict[str, float]:
         if np.any((np.abs(means) > _RING_SIGMAS * errors) & (np.abs(means) > _LEAST_PATTERN_PX)):
             found[side] = float(np.abs(means).max())
     return found
+
+
+def _place_deviations(result: RigCalibration) -> list[tuple[str, float, float]]:
+    """Return the deviations of boards from places with a standard deviation.
+
+    Each has the name of the view; the deviation of the centre of the board [m]; the largest
+    deviation of its six parameters in standard deviations.
+    """
+    model, parameters = result.model, result.fit.parameters
+    poses = model.board_poses(parameters)
+    deviations = []
+    for number, view in enumerate(model.views):
+        if 0.0 < view.place.sigma < np.inf:
+            own = slice(model.shared + 6 * number, model.shared + 6 * (number + 1))
+            pull = np.abs(parameters[own] / model.given_sigma[own]).max()
+            middle = np.append(view.left.points.mean(axis=0), 1.0)
+            away = np.linalg.norm((poses[number] - view.place.T_rig_board) @ middle)
+            deviations.append((view.name, float(away), float(pull)))
+    return deviations

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import HELD_FREELY, BoardView, Corners, Place
 from needle_tracker.calibrating.rig_fit import fit
-from needle_tracker.calibrating.rig_model import POSE, RigModel
+from needle_tracker.calibrating.rig_model import POSE, RigModel, board_pose, initial_board_poses
 from needle_tracker.optics.calibration import (
     LEAST_BASELINE,
     SIDES,
     Camera,
     StereoCalibration,
     Window,
-    pose_matrix,
 )
 
 Array = NDArray[np.float64]
@@ -143,9 +142,7 @@ def are_posed(cameras: StereoCalibration) -> bool:
     return bool(np.linalg.norm(cameras.right.centre - cameras.left.centre) >= LEAST_BASELINE)
 
 
-def first_calibration(
-    views: list[BoardView], cameras: StereoCalibration
-) -> tuple[StereoCalibration, Array]:
+def first_calibration(views: list[BoardView], cameras: StereoCalibration) -> StereoCalibration:
     """Return a calibration to start the adjustment from.
 
     A board at a known place defines `rig`; windows are ignored.
@@ -159,10 +156,8 @@ def first_calibration(
 
     Returns
     -------
-    calibration : StereoCalibration
+    StereoCalibration
         Initial values.
-    boards : ndarray, shape (len(views), 4, 4)
-        T_rig_board of each view.
 
     Raises
     ------
@@ -186,29 +181,7 @@ def first_calibration(
                 f"the place given for {anchor.name} is wrong"
             )
         placed.append(camera)
-    calibration = StereoCalibration(*placed)
-    return calibration, initial_board_poses(calibration, views)
-
-
-def initial_board_poses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
-    """Return T_rig_board of each view, shape (n, 4, 4): as given, else from one camera.
-
-    Parameters
-    ----------
-    calibration : StereoCalibration
-        Cameras; the windows are ignored.
-    views : list of BoardView
-        Views, each with the corners of at least one camera.
-    """
-    boards = []
-    for view in views:
-        if view.place.is_known:
-            boards.append(view.place.T_rig_board)
-            continue
-        side = next(side for side in SIDES if len(view.corners(side).points))
-        camera = calibration.cameras[side]
-        boards.append(np.linalg.inv(camera.T_optical_rig) @ board_pose(camera, view.corners(side)))
-    return np.stack(boards)
+    return StereoCalibration(*placed)
 
 
 def _lens(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Array, Array]:
@@ -237,19 +210,6 @@ def _lens(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Arr
             f"{LEAST_TILT_DEG:g} needed, 30 to 45 are good): tilt the board"
         )
     return np.asarray(matrix, dtype=np.float64), np.asarray(distortion).reshape(-1)[:5].copy()
-
-
-def board_pose(camera: Camera, corners: Corners) -> Array:
-    """Return the pose of the board in the optical frame, shape (4, 4), without refraction."""
-    _, rotation, translation = cv2.solvePnP(
-        corners.points,
-        corners.pixels,
-        camera.camera_matrix,
-        camera.distortion,
-        flags=cv2.SOLVEPNP_IPPE,
-    )
-    turn = np.asarray(cv2.Rodrigues(np.asarray(rotation).reshape(3))[0], dtype=np.float64)
-    return pose_matrix(turn, np.asarray(translation).reshape(3))
 
 
 class PairsApartError(UserError):
@@ -317,7 +277,7 @@ def _apart(views: list[BoardView], cameras: StereoCalibration) -> tuple[list[str
     apart, pose = _apart_in_air(cameras, in_air)
     kept = [view for view in views if view.name not in apart]
     if cameras.surface is not None and anchor_view(kept, cameras.surface) is not None:
-        calibration, _ = first_calibration(kept, _posed(cameras, pose))
+        calibration = first_calibration(kept, _posed(cameras, pose))
         for view in (view for view in both if view.place.under_surface):
             alike = [dataclasses.replace(view, place=Place(np.eye(4), True, np.inf))]
             if _misses(calibration, alike) > 2.0 * _alone(calibration, alike) + _SLACK_UNDER_PX:
@@ -344,7 +304,7 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
     pose, near = poses[best], away[best] <= 3.0 * nearest[best]
     for _ in range(_ROUNDS):
         kept = [view for view, is_near in zip(views, near, strict=True) if is_near]
-        model = RigModel(_posed(cameras, pose), kept, left[near])
+        model = RigModel(_posed(cameras, pose), kept)
         names = [f"right.{name}" for name in POSE]
         parameters = fit(model, model.start, names).parameters
         pose = model.calibration(parameters).right.T_optical_rig
@@ -356,11 +316,8 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
 
 def _posed(cameras: StereoCalibration, pose: Array) -> StereoCalibration:
     """Return the cameras with the left one at the origin, the right one at T_right_left."""
-    left, right = (
-        dataclasses.replace(camera, T_optical_rig=transform)
-        for camera, transform in ((cameras.left, np.eye(4)), (cameras.right, pose))
-    )
-    return StereoCalibration(left, right)
+    left = dataclasses.replace(cameras.left, T_optical_rig=np.eye(4))
+    return StereoCalibration(left, dataclasses.replace(cameras.right, T_optical_rig=pose))
 
 
 def _alone(calibration: StereoCalibration, views: list[BoardView]) -> Array:
@@ -371,7 +328,7 @@ def _alone(calibration: StereoCalibration, views: list[BoardView]) -> Array:
 
 def _misses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
     """Return the rms corner error of each view at the best-fitting pose of the board [px]."""
-    model = RigModel(calibration, views, initial_board_poses(calibration, views))
+    model = RigModel(calibration, views)
     # With one flat board, index and height of the surface are indistinguishable.
     names = ["refractive_index"] if any(view.place.under_surface for view in views) else []
     squares = np.sum(fit(model, model.start, names).residuals ** 2, axis=-1)

@@ -80,11 +80,6 @@ class CharucoBoard:
         )
 
     @property
-    def size(self) -> tuple[float, float]:
-        """Length along x and y [m]."""
-        return self.columns * self.square, self.rows * self.square
-
-    @property
     def corners(self) -> Array:
         """Inner corners in the frame of the board [m], shape ((columns-1)*(rows-1), 3)."""
         v, u = np.mgrid[1 : self.rows, 1 : self.columns]

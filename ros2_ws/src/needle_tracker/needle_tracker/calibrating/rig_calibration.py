@@ -139,8 +139,8 @@ def calibrate(
     tied = are_posed(cameras)
     if tied and relative_pose is not None:
         _check_relative_pose(cameras.right.T_optical_rig, relative_pose)
-    start, boards = first_calibration(views, cameras)
-    model = RigModel(start, views, boards, tied=tied)
+    start = first_calibration(views, cameras)
+    model = RigModel(start, views, tied=tied)
     names = model.names
     kinds = {name: name.split(".")[-1] for name in names}
     # With a given relative pose, the right camera moves with the left one.

@@ -96,34 +96,6 @@ def fit(
     return RigFit(parameters, covariance, residuals, sigma, cost)
 
 
-def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, float]]:
-    """Return the deviations of boards from places with a standard deviation.
-
-    Parameters
-    ----------
-    model : RigModel
-        Fitted model.
-    result : RigFit
-        Result of the fit.
-
-    Returns
-    -------
-    list of (str, float, float)
-        Name of the view; deviation of the centre of the board [m]; the largest deviation of its six
-        parameters in standard deviations.
-    """
-    poses = model.board_poses(result.parameters)
-    deviations = []
-    for number, view in enumerate(model.views):
-        if 0.0 < view.place.sigma < np.inf:
-            own = slice(model.shared + 6 * number, model.shared + 6 * (number + 1))
-            pull = np.abs(result.parameters[own] / model.given_sigma[own]).max()
-            middle = np.append(view.left.points.mean(axis=0), 1.0)
-            away = np.linalg.norm((poses[number] - view.place.T_rig_board) @ middle)
-            deviations.append((view.name, float(away), float(pull)))
-    return deviations
-
-
 def misfit_px(model: RigModel, result: RigFit) -> float:
     """Return the error of the model: rms of a corner coordinate beyond its noise [px].
 

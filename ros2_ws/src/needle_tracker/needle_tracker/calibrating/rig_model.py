@@ -21,6 +21,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -83,8 +84,6 @@ class RigModel:
         Initial cameras and windows.
     views : list of BoardView
         Views of the board.
-    boards : ndarray, shape (len(views), 4, 4)
-        Initial T_rig_board of each view.
     tied : bool
         Whether the relative pose of the cameras is fixed; rotation and translation of the right
         camera are then unused.
@@ -109,7 +108,7 @@ class RigModel:
     """
 
     def __init__(
-        self, start: StereoCalibration, views: list[BoardView], boards: Array, *, tied: bool = False
+        self, start: StereoCalibration, views: list[BoardView], *, tied: bool = False
     ) -> None:
         self.views, self.tied = views, tied
         self._start, self._surface = start, start.surface
@@ -118,7 +117,7 @@ class RigModel:
         windows = own if self._surface is None else SURFACE
         self.names = (*cameras, "square_size", *windows)
         self.shared = len(self.names)
-        self._boards = np.asarray(boards, dtype=np.float64).reshape(-1, 4, 4)
+        self._boards = initial_board_poses(start, views)
         corners = [view.corners(side) for side in SIDES for view in views]
         self._points = np.concatenate([one.points for one in corners])
         self.pixels = np.concatenate([one.pixels for one in corners])
@@ -127,10 +126,8 @@ class RigModel:
         self.seen_by = {side: side_of == number for number, side in enumerate(SIDES)}
         self._under = np.array([view.place.under_surface for view in views])[self.view_of]
         self.start = np.zeros(self.shared + 6 * len(views))
-        for side in SIDES:
-            camera = start.cameras[side]
-            matrix = camera.camera_matrix
-            lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *camera.distortion]
+        for side, camera in start.cameras.items():
+            lens = [*camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion]
             self.start[camera_slice(side)][: len(LENS)] = lens
         if self._surface is not None:
             height = self._surface.point[0]
@@ -231,6 +228,40 @@ class RigModel:
         return dataclasses.replace(
             window, point=window.point + offset * window.normal, normal=turned
         )
+
+
+def initial_board_poses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
+    """Return T_rig_board of each view, shape (n, 4, 4): as given, else from one camera.
+
+    Parameters
+    ----------
+    calibration : StereoCalibration
+        Cameras; the windows are ignored.
+    views : list of BoardView
+        Views, each with the corners of at least one camera.
+    """
+    boards = []
+    for view in views:
+        if view.place.is_known:
+            boards.append(view.place.T_rig_board)
+            continue
+        side = next(side for side in SIDES if len(view.corners(side).points))
+        camera = calibration.cameras[side]
+        boards.append(np.linalg.inv(camera.T_optical_rig) @ board_pose(camera, view.corners(side)))
+    return np.stack(boards)
+
+
+def board_pose(camera: Camera, corners: Corners) -> Array:
+    """Return the pose of the board in the optical frame, shape (4, 4), without refraction."""
+    _, rotation, translation = cv2.solvePnP(
+        corners.points,
+        corners.pixels,
+        camera.camera_matrix,
+        camera.distortion,
+        flags=cv2.SOLVEPNP_IPPE,
+    )
+    turn = np.asarray(cv2.Rodrigues(np.asarray(rotation).reshape(3))[0], dtype=np.float64)
+    return pose_matrix(turn, np.asarray(translation).reshape(3))
 
 
 def _in_air(camera: Camera) -> Camera:
@@ -334,7 +365,7 @@ def _tip_slopes(calibration: StereoCalibration, *, tied: bool) -> Array:
     points = needle_points(calibration)
     nowhere = Corners(points, np.zeros((len(points), 2)))
     view = BoardView("", Place(np.eye(4), under_surface=True), nowhere, nowhere)
-    model = RigModel(calibration, [view], np.eye(4)[None], tied=tied)
+    model = RigModel(calibration, [view], tied=tied)
     free = np.zeros(len(model.start), dtype=bool)
     free[: model.shared] = True
     # Residuals are measured minus expected: the sign changes twice.

@@ -11,6 +11,7 @@ from needle_sim.camera.stereo_rig import StereoRig
 from needle_tracker.calibrating.calibrate_stereo import report
 from needle_tracker.calibrating.calibration_outliers import (
     contradictions,
+    misfits,
     ring_patterns,
 )
 from needle_tracker.calibrating.calibration_session import HELD_FREELY, BoardView, Corners
@@ -71,6 +72,19 @@ def test_a_wrong_place_is_found(
     found = [*views[5:number], wrong, *views[number + 1 :]]
     result = calibrate(found, SIZES, GIVEN, lenses_of(calibration))
     assert any(text in one for one in contradictions(result))
+
+
+def test_a_board_that_is_not_flat_is_found_although_one_camera_sees_others_alone(
+    box_result: RigCalibration,
+) -> None:
+    residuals, model = box_result.fit.residuals.copy(), box_result.model
+    assert misfits(box_result) == []
+    number = next(number for number, view in enumerate(model.views) if view.name == "box_00")
+    residuals[(model.view_of == number) & model.seen_by["right"]] += 1.0
+    bent = dataclasses.replace(box_result.fit, residuals=residuals)
+    ((view, text),) = misfits(dataclasses.replace(box_result, fit=bent))
+    assert view is model.views[number]
+    assert text.startswith("box_00, right camera: 1.4")
 
 
 def test_a_lens_that_plumb_bob_does_not_describe_is_not_ok(result: RigCalibration) -> None:
