@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
-from needle_tracker.calibrating.calibration_session import BoardView, Corners, Place
+from needle_tracker.calibrating.calibration_session import HELD_FREELY, BoardView, Corners, Place
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.optics.calibration import (
     SIDES,
@@ -87,7 +87,7 @@ def view_of(
     rig: StereoRig,
     name: str,
     pose: Array,
-    place: Place | None,
+    place: Place,
     rng: np.random.Generator,
     noise: float = NOISE_PX,
     board: CharucoBoard = BOARD,
@@ -96,7 +96,7 @@ def view_of(
     points, found = board.corners, []
     for camera in (rig.left, rig.right):
         moved = points @ pose[:3, :3].T + pose[:3, 3]
-        pixels = pixels_of(camera, moved, place is not None and place.under_surface)
+        pixels = pixels_of(camera, moved, place.under_surface)
         pixels = pixels + rng.normal(0.0, noise, pixels.shape)
         end = np.array([camera.image_width, camera.image_height]) - 5
         inside = np.all((pixels > 5) & (pixels < end), axis=1)
@@ -118,7 +118,8 @@ def held(turn: Rotation, up: Array, middle: Array, board: CharucoBoard = BOARD) 
     pose = np.eye(4)
     z = np.array([0.0, 0.0, 1.0])
     pose[:3, :3] = turn.as_matrix() @ np.stack([z, np.cross(-up, z), -up], axis=-1)
-    pose[:3, 3] = middle - pose[:3, :3] @ [*(0.5 * np.array(board.size)), 0.0]
+    half = 0.5 * board.square * np.array([board.columns, board.rows, 0.0])
+    pose[:3, 3] = middle - pose[:3, :3] @ half
     return pose
 
 
@@ -177,8 +178,8 @@ def take(
 ) -> list[BoardView]:
     """Return the views of a calibration session; `places` are those of the session file."""
     rng = np.random.default_rng(seed)
-    poses: list[tuple[str, Array, Place | None]] = [
-        (f"free_{i:02d}", free_pose(rng, board=board), None) for i in range(free)
+    poses: list[tuple[str, Array, Place]] = [
+        (f"free_{i:02d}", free_pose(rng, board=board), HELD_FREELY) for i in range(free)
     ]
     poses += [(name, scatter(place, rng), place) for name, place in places.items()]
     return [view_of(rig, name, pose, place, rng, noise, board) for name, pose, place in poses]
@@ -189,14 +190,14 @@ def take_in_box(
 ) -> list[BoardView]:
     """Return boards in front of the windows in turn, one standing in the box, some held in it."""
     rng = np.random.default_rng(seed)
-    poses: list[tuple[str, Array, Place | None]] = []
+    poses: list[tuple[str, Array, Place]] = []
     for i in range(air):
         up, across = np.eye(3)[i % 2], np.eye(3)[1 - i % 2]
         away = rng.uniform(0.07, 0.20) + 0.04 * (i % 2)
         middle = away * up + rng.uniform(-0.03, 0.03) * across
         middle[2] += rng.uniform(0.035, 0.09)
         turn = _tilt(up, (25.0, 50.0), rng.uniform(-60.0, 60.0), rng)
-        poses.append((f"air_{i:02d}", held(turn, up, middle, BOX_BOARD), None))
+        poses.append((f"air_{i:02d}", held(turn, up, middle, BOX_BOARD), HELD_FREELY))
     poses.append(("stand", STANDS.T_rig_board, STANDS))
     for i in range(box):
         turn = Rotation.from_rotvec(np.deg2rad(rng.uniform(-12.0, 12.0, 3)))

@@ -43,7 +43,7 @@ from needle_core.messages import HoldSession
 from needle_core.retraction import Retraction
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_tracker.optics.calibration import rotation_matrix
-from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, grey_image
+from needle_tracker.sources.image_encodings import decoded
 
 PAGE = "page"
 """Name of the port."""
@@ -283,14 +283,9 @@ class Console(Component):
         return ()
 
     def _on_image(self, side: str, message: m.Image, at: Moment) -> Actions:
-        if message.encoding not in ENCODINGS:
-            return
-        least = message.width * bytes_per_pixel(message.encoding)
-        if not 0 < least <= message.step or len(message.data) != message.step * message.height:
-            return
-        rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
-        image = grey_image(rows, message.width, message.encoding)
-        yield Send(PAGE, (CameraImage(side, np.ascontiguousarray(image)),))
+        image = decoded(message, side).pixels
+        if image is not None:
+            yield Send(PAGE, (CameraImage(side, np.ascontiguousarray(image)),))
 
 
 def _position(message: m.PoseWithCovariance) -> tuple[Array, Array]:

@@ -7,7 +7,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -30,7 +29,6 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.files.installed import find_shared_file
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration, load_calibration
 from needle_tracker.sources.stereo_source import (
@@ -71,11 +69,6 @@ class StereoCameraParameters:
     def __post_init__(self) -> None:
         """Check the fields."""
         check_fields(self)
-
-    def calibration(self) -> StereoCalibration:
-        """Return the calibration of the cameras, the installed one by default."""
-        installed = "needle_tracker", "config/calibration.yaml"
-        return load_calibration(Path(self.calibration_file or find_shared_file(*installed)))
 
 
 class StereoCamera(Component):
@@ -198,7 +191,7 @@ def make_camera(settings: StereoCameraParameters, name: str = StereoCamera.name)
     UserError
         A bad calibration file.
     """
-    return StereoCamera(settings, settings.calibration(), name)
+    return StereoCamera(settings, load_calibration(settings.calibration_file), name)
 
 
 def open_pairs(settings: StereoCameraParameters) -> PairPort:
@@ -209,7 +202,8 @@ def open_pairs(settings: StereoCameraParameters) -> PairPort:
     UserError
         A bad source.
     """
-    names, sizes = (settings.left, settings.right), settings.calibration().sizes
+    sizes = load_calibration(settings.calibration_file).sizes
+    names = settings.left, settings.right
     return PairPort(open_source(names, sizes, settings.rate, time.time_ns, loop=settings.loop))
 
 

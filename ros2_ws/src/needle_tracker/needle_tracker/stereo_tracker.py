@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import partial
-from pathlib import Path
 
 from needle_core import messages as m
 from needle_core.component import (
@@ -24,9 +23,7 @@ from needle_core.component import (
     Publish,
     Timer,
 )
-from needle_core.diagnostics import Diagnostic, Level
-from needle_core.files.installed import find_shared_file
-from needle_core.files.yaml_files import read_calibration
+from needle_core.diagnostics import Level
 from needle_tracker.answers.annotation import annotate
 from needle_tracker.answers.health import Health
 from needle_tracker.answers.pair_answers import Answer, PairAnswers
@@ -39,7 +36,7 @@ from needle_tracker.answers.tracker_messages import (
     tip_pose_message,
 )
 from needle_tracker.filter.measurement import TrackState
-from needle_tracker.optics.calibration import SIDES, StereoCalibration, calibration_from
+from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 TIP, TIP_POSE = "needle/tip", "needle/tip_pose"
@@ -55,9 +52,7 @@ class StereoTipTracker(Component):
     settings : StereoTrackerParameters
         Parameters of the node.
     calibration : StereoCalibration
-        The stereo rig.
-    calibration_text : str
-        Text of its file, which is published for recorders.
+        The stereo rig; the text of its file is published for recorders.
     name : str
         Full name of the node.
 
@@ -72,19 +67,15 @@ class StereoTipTracker(Component):
     name = "stereo_tracker"
 
     def __init__(
-        self,
-        settings: StereoTrackerParameters,
-        calibration: StereoCalibration,
-        calibration_text: str = "",
-        name: str = name,
+        self, settings: StereoTrackerParameters, calibration: StereoCalibration, name: str = name
     ) -> None:
         self.name, self.settings = name, settings
         self.has_annotation_subscriber = False
         self._cameras = calibration.cameras
-        self._calibration_text = calibration_text
+        self._calibration_text = calibration.text
         self._is_calibration_published = False
         self.answers = PairAnswers(calibration, settings)
-        self._health = Health()
+        self._health = Health(self.answers)
         rate = settings.annotated_rate
         self._annotated_period = 1.0 / rate if rate > 0.0 else math.inf
         self._annotated_at = -math.inf
@@ -121,9 +112,7 @@ class StereoTipTracker(Component):
                 yield Publish(TIP, tip_message(tip, stamp_ns))
             yield Publish(TIP_POSE, tip_pose_message(tip, stamp_ns))
             yield from self._annotate(answer, at)
-            if answer.refused:
-                self._health.add_refused(answer.refused, at.steady)
-            self._health.add_pair(answer.arrival, at.steady, answer.measured)
+            self._health.add_pair(answer, at.steady)
             yield from self._report(at)
 
     # ---- inputs -------------------------------------------------------------------------------
@@ -133,7 +122,7 @@ class StereoTipTracker(Component):
         rows = []
         for side in SIDES:
             on_image, on_info = partial(self._on_image, side), partial(self._on_camera_info, side)
-            rows.append(Input(image_topic(side), m.Image, on_image, delivery))
+            rows.append(Input(f"stereo/{side}/image_raw", m.Image, on_image, delivery))
             rows.append(Input(f"stereo/{side}/camera_info", m.CameraInfo, on_info, delivery))
         return rows
 
@@ -167,19 +156,13 @@ class StereoTipTracker(Component):
             yield Publish(ANNOTATED, picture_message(picture, answer.pair.stamp))
 
     def _report(self, at: Moment) -> Actions:
-        answers, health = self.answers, self._health
-        health.update_unpaired(at.steady, answers.matcher)
-        yield from self._diagnose("track", health.track())
-        yield from self._diagnose("images", health.images(at.steady, answers))
-        yield from self._diagnose("joints", health.joints(answers))
-
-    def _diagnose(self, part: str, diagnostic: Diagnostic) -> Actions:
-        """Publish the diagnostics of a part; log it when it turns bad."""
-        yield Diagnose(part, diagnostic)
-        kind = diagnostic.message.partition(":")[0]
-        if kind != self._reported.get(part) and diagnostic.level >= Level.WARN:
-            yield Log("warning", f"{part}: {diagnostic.message}")
-        self._reported[part] = kind
+        """Publish the diagnostics of all parts; log a part when it turns bad."""
+        for part, diagnostic in self._health.parts(at.steady).items():
+            yield Diagnose(part, diagnostic)
+            kind = diagnostic.message.partition(":")[0]
+            if kind != self._reported.get(part) and diagnostic.level >= Level.WARN:
+                yield Log("warning", f"{part}: {diagnostic.message}")
+            self._reported[part] = kind
 
 
 def make_tracker(
@@ -192,12 +175,4 @@ def make_tracker(
     UserError
         A bad calibration file.
     """
-    installed = partial(find_shared_file, "needle_tracker", "config/calibration.yaml")
-    path = Path(settings.calibration_file or installed())
-    text = read_calibration(path)
-    return StereoTipTracker(settings, calibration_from(text, path), text, name)
-
-
-def image_topic(side: str) -> str:
-    """Return the relative topic of a camera's images."""
-    return f"stereo/{side}/image_raw"
+    return StereoTipTracker(settings, load_calibration(settings.calibration_file), name)

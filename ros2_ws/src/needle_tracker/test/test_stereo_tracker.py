@@ -110,7 +110,8 @@ def make(
 
     def make(**parameters: Any) -> Bench:
         settings = StereoTrackerParameters(**parameters)
-        return Bench(StereoTipTracker(settings, calibration, "text of the file"))
+        with_text = dataclasses.replace(calibration, text="text of the file")
+        return Bench(StereoTipTracker(settings, with_text))
 
     return make
 

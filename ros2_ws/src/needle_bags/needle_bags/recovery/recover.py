@@ -45,8 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         recovery = recover_bag(options.bag)
         for line in _lines(options.bag, recovery):
             print(line)
-        if file is not None:
-            write_json(file, _flat(recovery))
+        write_json(file, _flat(recovery))
         return EXIT_DONE
 
     return run_command(command)

@@ -173,8 +173,7 @@ def _report(given: argparse.Namespace) -> int:
             print(f"{letter} {words}: {sentence}")
         print(page)
         summary = pair_values(summaries)
-    if given.json is not None:
-        write_json(given.json, summary)
+    write_json(given.json, summary)
     return EXIT_DONE
 
 

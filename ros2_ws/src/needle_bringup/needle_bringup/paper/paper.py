@@ -61,8 +61,7 @@ def _paper(arguments: Sequence[str]) -> int:
     (out / PAGE).write_text(page(results), encoding="utf-8")
     print(as_text(list(table(results))))
     print(f"written: {out / PAGE}")
-    if file is not None:
-        write_json(file, key_figures(results))
+    write_json(file, key_figures(results))
     return EXIT_DONE
 
 

@@ -177,8 +177,7 @@ def _report(options: SimulateOptions, bag: Path, started_at: float) -> int:
     write_report(run, summary)
     summary["wall_s"] = time.time() - started_at
     for path in (bag / SUMMARY, options.json):
-        if path is not None:
-            write_json(path, summary)
+        write_json(path, summary)
     print(describe(summary, bag))
     return EXIT_DONE if summary["converged"] else EXIT_MISSED
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from needle_console.console import (
@@ -22,7 +21,6 @@ from needle_console.view.advice import Button
 from needle_console.view.camera_view import CameraView
 from needle_console.view.snapshot import Array, Snapshot
 from needle_core.component import Batch, Log
-from needle_core.files.installed import find_shared_file
 from needle_core.messages import HOLD_LIFETIME, Point, Pose, quaternion_from_rotation
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import stereo_views
@@ -152,10 +150,5 @@ def _vector(values: Array) -> tuple[float, float, float]:
 
 
 def _cameras(file: str) -> dict[str, Any]:
-    path = (
-        Path(file).expanduser()
-        if file
-        else find_shared_file("needle_tracker", "config/calibration.yaml")
-    )
-    left, right = stereo_views(load_calibration(path))
+    left, right = stereo_views(load_calibration(file))
     return {"left": left, "right": right}

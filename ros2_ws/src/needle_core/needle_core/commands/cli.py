@@ -81,13 +81,13 @@ def finite_or_none(value: JsonValue) -> JsonValue:
     return value
 
 
-def write_json(path: Path, values: Mapping[str, JsonValue]) -> None:
+def write_json(path: Path | None, values: Mapping[str, JsonValue]) -> None:
     """Write a flat JSON object; missing values become null, never NaN.
 
     Parameters
     ----------
-    path : Path
-        File to write, in an existing folder.
+    path : Path or None
+        File to write, in an existing folder; None if none was given, then nothing is written.
     values : mapping
         Key to value; keys end in their unit.
 
@@ -96,5 +96,7 @@ def write_json(path: Path, values: Mapping[str, JsonValue]) -> None:
     UserError
         If the file cannot be written.
     """
+    if path is None:
+        return
     text = json.dumps({key: finite_or_none(value) for key, value in values.items()}, indent=2)
     write_text(path, text + "\n")

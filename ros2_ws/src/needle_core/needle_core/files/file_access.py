@@ -41,6 +41,16 @@ def write_text(path: Path, text: str) -> None:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
+def make_folder(folder: Path) -> None:
+    """Create a folder, or accept an empty one; raise a `UserError` with the reason if not."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise UserError(f"{folder} is not empty: give a new folder")
+    except OSError as error:
+        raise UserError(f"cannot write {folder}: {error.strerror}") from error
+
+
 def replace_file(path: Path, data: bytes) -> None:
     """Write a file atomically and flush it to the disk; a link of that name is replaced.
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from needle_core.errors import UserError
+from needle_core.files.file_access import write_text
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -30,6 +32,12 @@ def read_yaml(path: Path) -> Any:
         return load_yaml(read_text(path))
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
+
+
+def write_yaml(path: Path, content: Any, comments: Iterable[str]) -> None:
+    """Write a YAML file with lines of comment at its top; a `UserError` has the reason if not."""
+    text = yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120)
+    write_text(path, "".join(f"# {line}\n" for line in comments) + text)
 
 
 def load_yaml(text: str) -> Any:

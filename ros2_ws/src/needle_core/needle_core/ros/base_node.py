@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -16,6 +18,7 @@ from needle_core import component
 from needle_core.component import Delivery
 from needle_core.convert import to_ros
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
 from needle_core.message_types import rclpy_types
 from needle_core.messages import Diagnostics, Status
 
@@ -47,6 +50,17 @@ class _DestroyedOnFailure(type):
 
 class WholeNode(Node, metaclass=_DestroyedOnFailure):
     """Node that is destroyed if its construction fails."""
+
+
+def spin_until(node: Node, condition: Callable[[], Any], timeout: float, failure: str = "") -> None:
+    """Spin until a condition holds (`bool` never does); raise any `failure` at the timeout [s]."""
+    end = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() >= end:
+            if failure:
+                raise UserError(failure)
+            return
+        rclpy.spin_once(node, timeout_sec=0.02)
 
 
 # ---- names ------------------------------------------------------------------------------------

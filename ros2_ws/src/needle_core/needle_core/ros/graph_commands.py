@@ -26,22 +26,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from needle_core.errors import UserError
 from needle_core.files.yaml_files import load_yaml
-from needle_core.ros.base_node import full_name
+from needle_core.ros.base_node import full_name, spin_until
 
 # Time to discover all endpoints, to discover a given node or topic, and for an answer [s].
 DISCOVERY, SEARCH_TIMEOUT, ANSWER_TIMEOUT = 1.0, 5.0, 10.0
 MAX_LENGTH = 128  # of a printed array or text
-
-
-def spin_until(node: Node, condition: Callable[[], Any], timeout: float, failure: str = "") -> None:
-    """Spin until a condition holds (`bool` never does); raise any `failure` at the timeout [s]."""
-    end = time.monotonic() + timeout
-    while not condition():
-        if time.monotonic() >= end:
-            if failure:
-                raise UserError(failure)
-            return
-        rclpy.spin_once(node, timeout_sec=0.02)
 
 
 # ---- messages ---------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from needle_core.errors import UserError
+from needle_core.files.file_access import make_folder
 from needle_sim.camera.view import GreyImage
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.se3 import FloatArray
@@ -113,9 +114,7 @@ class ImageFolder:
     ) -> None:
         self._folder = folder
         with self._reported_errors():
-            folder.mkdir(parents=True, exist_ok=True)
-            if any(folder.iterdir()):
-                raise UserError(f"{folder} is not empty")
+            make_folder(folder)
             calibration = calibration_file.read_bytes()
             (folder / "calibration.yaml").write_bytes(calibration)
             for side in ("left", "right"):

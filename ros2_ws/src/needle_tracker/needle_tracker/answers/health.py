@@ -2,76 +2,68 @@
 
 from __future__ import annotations
 
-import dataclasses
+import math
 from collections import Counter, deque
-from typing import Any
 
 from needle_core.diagnostics import Diagnostic, Level
-from needle_tracker.answers.pair_answers import SUSPICION, PairAnswers
+from needle_tracker.answers.pair_answers import SUSPICION, Answer, PairAnswers
 from needle_tracker.filter.measurement import Measurement, TrackState
-from needle_tracker.sources.pairing import OTHER_SIDE, PairMatcher
+from needle_tracker.sources.pairing import OTHER_SIDE
 
-WARNING_DURATION = 5.0  # duration of a warning after its cause [s]
-CLOCKS_DIFFER = 1_000_000_000  # lead of a pair over the first joint state that is a fault [ns]
-PARTNER_LATE = 0.5  # delay before an image without a partner is reported [s]
+_DURATION = 5.0  # duration of a warning after its cause [s]
+_CLOCKS_DIFFER = 1_000_000_000  # lead of a pair over the first joint state that is a fault [ns]
+_PARTNER_LATE = 0.5  # delay before an image without a partner is reported [s]
 _RATE_WINDOW = 5.0  # [s]
-_NOTHING_YET = Measurement(None, TrackState.SEARCHING, "no images yet")
 _EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"
 
 
-@dataclasses.dataclass
 class Health:
     """Counters of the node; times are steady times, passed as arguments [s].
 
+    Parameters
+    ----------
+    answers : PairAnswers
+        Core of the node.
+
     Attributes
     ----------
-    refused : Counter of str
-        Pairs that were not processed, by reason.
-    rejected : Counter of str
-        Pairs without a tip, by reason.
+    joints_without_insertion : int
+        Number of joint states without an insertion.
     """
 
-    refused: Counter[str] = dataclasses.field(default_factory=Counter)
-    rejected: Counter[str] = dataclasses.field(default_factory=Counter)
-    joints_without_insertion: int = 0
-    last_refusal: tuple[float, str] | None = None
-    _last_image: dict[str, float] = dataclasses.field(default_factory=dict)
-    _first_image: float = 0.0
-    _last_unpaired: float | None = None
-    _unpaired: int = 0
-    _done: deque[tuple[float, float]] = dataclasses.field(
-        default_factory=lambda: deque(maxlen=1000)
-    )
-    _tips: int = 0
-    _measured: Measurement = _NOTHING_YET
+    def __init__(self, answers: PairAnswers) -> None:
+        self._answers = answers
+        self.joints_without_insertion = 0
+        # Pairs that were not processed, and pairs without a tip, by reason.
+        self._refused, self._rejected = Counter[str](), Counter[str]()
+        self._refusal, self._refused_at = "", -math.inf
+        self._unpaired, self._unpaired_at = 0, -math.inf
+        self._image_at: dict[str, float] = {}
+        self._done: deque[tuple[float, float]] = deque(maxlen=1000)
+        self._tips = 0
+        self._measured = Measurement(None, TrackState.SEARCHING, "no images yet")
 
     def add_image(self, side: str, now: float) -> None:
         """Count an image of one side."""
-        if not self._last_image:
-            self._first_image = now
-        self._last_image[side] = now
+        self._image_at = {**dict.fromkeys(OTHER_SIDE, now), **self._image_at, side: now}
 
-    def add_refused(self, reason: str, now: float) -> None:
-        """Count a pair that was not processed."""
-        self.refused[reason] += 1
-        self.last_refusal = (now, reason)
-
-    def add_pair(self, arrival: float, now: float, measured: Measurement) -> None:
-        """Count a pair, complete at `arrival` and answered at `now`."""
-        self._done.append((now, now - arrival))
-        self._measured = measured
-        if measured.tip is None:
-            self.rejected[measured.reason] += 1
+    def add_pair(self, answer: Answer, now: float) -> None:
+        """Count a pair that was answered at `now`."""
+        self._done.append((now, now - answer.arrival))
+        self._measured = answer.measured
+        if answer.refused:
+            self._refused[answer.refused] += 1
+            self._refusal, self._refused_at = answer.refused, now
+        if answer.measured.tip is None:
+            self._rejected[answer.measured.reason] += 1
         else:
             self._tips += 1
 
-    def update_unpaired(self, now: float, matcher: PairMatcher[Any]) -> None:
-        """Record whether images were dropped without a partner since the last call."""
-        if matcher.unpaired.total() > self._unpaired:
-            self._unpaired, self._last_unpaired = matcher.unpaired.total(), now
+    def parts(self, now: float) -> dict[str, Diagnostic]:
+        """Return the health of the track, of the images and of the joint states."""
+        return {"track": self._track(), "images": self._images(now), "joints": self._joints()}
 
-    def track(self) -> Diagnostic:
-        """Return the health of the track."""
+    def _track(self) -> Diagnostic:
         measured, (zero, scale) = self._measured, self._measured.stage
         state, reason = measured.state, measured.reason
         good = state in (TrackState.TRACKING, TrackState.ENTRY) and not reason
@@ -83,13 +75,14 @@ class Health:
             "stage zero [mm]": f"{1e3 * zero:.2f}",
             "stage scale error [%]": f"{100 * scale:.2f}",
         }
-        values.update({f"no tip: {reason}": str(n) for reason, n in self.rejected.items()})
+        values.update({f"no tip: {reason}": str(n) for reason, n in self._rejected.items()})
         message = state.value + (f": {reason}" if reason else "")
         return Diagnostic(Level.OK if good else Level.WARN, message, values)
 
-    def images(self, now: float, answers: PairAnswers) -> Diagnostic:
-        """Return the health of the images and their pairing."""
-        matcher = answers.matcher
+    def _images(self, now: float) -> Diagnostic:
+        matcher = self._answers.matcher
+        if matcher.unpaired.total() > self._unpaired:
+            self._unpaired, self._unpaired_at = matcher.unpaired.total(), now
         recent = [(at, took) for at, took in self._done if now - at <= _RATE_WINDOW]
         latencies = sorted(took for _, took in recent)
         values = {
@@ -99,18 +92,17 @@ class Health:
             "latency_max_ms": f"{1e3 * latencies[-1]:.1f}" if recent else "",
             "left_without_right": str(matcher.unpaired["left"]),
             "right_without_left": str(matcher.unpaired["right"]),
-            "pairs_refused": str(self.refused.total()),
+            "pairs_refused": str(self._refused.total()),
             "pair_tolerance_ms": f"{1e-6 * matcher.tolerance:.2f}",
         }
         if matcher.skew is not None:
             skews = zip(("skew_median_ms", "skew_max_ms"), matcher.skew, strict=True)
             values.update({name: f"{1e-6 * skew:.2f}" for name, skew in skews})
-        values.update({f"refused: {reason}": str(n) for reason, n in self.refused.items()})
-        return Diagnostic(*self._images_level(now, answers), values)
+        values.update({f"refused: {reason}": str(n) for reason, n in self._refused.items()})
+        return Diagnostic(*self._images_level(now), values)
 
-    def joints(self, answers: PairAnswers) -> Diagnostic:
-        """Return the health of the joint states."""
-        history = answers.insertions
+    def _joints(self) -> Diagnostic:
+        answers, history = self._answers, self._answers.insertions
         values = {
             "without_insertion_joint": str(self.joints_without_insertion),
             "not_finite": str(history.rejected),
@@ -118,30 +110,28 @@ class Health:
             "pairs_before_joint_states": str(answers.unanswered),
         }
         level, message = Level.OK, "insertion known" if len(history) else "no joint states yet"
-        if answers.too_early > CLOCKS_DIFFER:
+        if answers.too_early > _CLOCKS_DIFFER:
             early = f"exposed {1e-9 * answers.too_early:.1f} s before the first joint state"
             level, message = Level.WARN, f"no pair is processed: {early}"
         elif answers.joints_silent:
             level, message = Level.WARN, "no joint state follows the images: insertion unknown"
         return Diagnostic(level, message, values)
 
-    def _images_level(self, now: float, answers: PairAnswers) -> tuple[Level, str]:
-        if self.last_refusal is not None and now - self.last_refusal[0] <= WARNING_DURATION:
-            return Level.ERROR, f"pair refused: {self.last_refusal[1]}"
-        for problem in answers.camera_info.values():
-            if problem.text:
-                return Level.ERROR, problem.text
-        if answers.swap.suspected:
-            return Level.WARN, f"{SUSPICION}; {_EXCHANGE}"
-        return self._pairing_level(now, answers.matcher)
-
-    def _pairing_level(self, now: float, matcher: PairMatcher[Any]) -> tuple[Level, str]:
-        for side, other in OTHER_SIDE.items():
-            last = self._last_image.get(other, self._first_image)
-            if matcher.waiting(side) and now - last > PARTNER_LATE:
-                return Level.WARN, f"{side} images without {other}"
-        if self._last_unpaired is not None and now - self._last_unpaired <= WARNING_DURATION:
-            return Level.WARN, "images without a partner were dropped"
-        if not self._last_image:
-            return Level.WARN, "no images yet"
-        return Level.OK, "pairs complete"
+    def _images_level(self, now: float) -> tuple[Level, str]:
+        """Return the first of the states of the images that holds."""
+        answers, waiting = self._answers, self._answers.matcher.waiting
+        late = {side for side, at in self._image_at.items() if now - at > _PARTNER_LATE}
+        refused, dropped = (now - at <= _DURATION for at in (self._refused_at, self._unpaired_at))
+        states = (
+            (Level.ERROR, f"pair refused: {self._refusal}", refused),
+            *((Level.ERROR, info.text, info.text) for info in answers.camera_info.values()),
+            (Level.WARN, f"{SUSPICION}; {_EXCHANGE}", answers.swap.suspected),
+            *(
+                (Level.WARN, f"{side} images without {other}", waiting(side) and other in late)
+                for side, other in OTHER_SIDE.items()
+            ),
+            (Level.WARN, "images without a partner were dropped", dropped),
+            (Level.WARN, "no images yet", not self._image_at),
+            (Level.OK, "pairs complete", True),
+        )
+        return next((level, message) for level, message, holds in states if holds)

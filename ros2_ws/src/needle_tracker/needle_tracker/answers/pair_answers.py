@@ -13,12 +13,10 @@ from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.filter.needle_tracker import Image, NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.sources.image_encodings import Frame
 from needle_tracker.sources.pairing import InsertionHistory, Pair, PairMatcher
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
@@ -93,14 +91,6 @@ class SwapWatch:
         swapped = self._swapped.process(right, left, insertion)
         self._agreeing = self._agreeing + 1 if swapped.tip is not None else 0
         self.suspected = self._agreeing >= _AGREEING
-
-
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """A received image: `pixels` (shared with the message), or the problem with it."""
-
-    pixels: NDArray[np.uint8] | None
-    problem: str = ""
 
 
 class CameraInfoProblem(NamedTuple):
@@ -191,30 +181,20 @@ class PairAnswers:
                 self.unanswered += 1
                 self._queue.popleft()
                 continue
-            if not (self.joints_silent or self.insertions.is_bracketed(pair.stamp)):
+            if not self.joints_silent and self.insertions.latest < pair.stamp:
                 if now - arrival < self._joint_timeout:
                     return
                 self.joints_silent = True
             self._queue.popleft()
-            answer = self._answer(arrival, pair)
-            yield answer
+            refused, insertion = self._refusal(pair), self.insertions.at(pair.stamp)
+            left, right = pair.left.pixels, pair.right.pixels
+            if refused or left is None or right is None:
+                yield Answer(pair, arrival, self.tracker.skip(refused), refused)
+                continue
+            measured = self.tracker.process(left, right, insertion)
+            yield Answer(pair, arrival, measured, refused)
             # The check for swapped images must not delay the answer.
-            self._check_swap(answer)
-
-    def _answer(self, arrival: float, pair: Pair[Frame]) -> Answer:
-        refused = self._refusal(pair)
-        left, right = pair.left.pixels, pair.right.pixels
-        if refused or left is None or right is None:
-            measured = self.tracker.skip(refused)
-        else:
-            measured = self.tracker.process(left, right, self.insertions.at(pair.stamp))
-        return Answer(pair, arrival, measured, refused)
-
-    def _check_swap(self, answer: Answer) -> None:
-        pair = answer.pair
-        left, right = pair.left.pixels, pair.right.pixels
-        if left is not None and right is not None and not answer.refused:
-            self.swap.update(left, right, self.insertions.at(pair.stamp), answer.measured)
+            self.swap.update(left, right, insertion, measured)
 
     def _refusal(self, pair: Pair[Frame]) -> str:
         """Return the reason for rejecting a pair; a long step back in time resets the tracker."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -21,43 +20,43 @@ _INSIDE_95 = 7.814728
 """95 % quantile of chi-squared with three degrees of freedom."""
 
 
-@dataclasses.dataclass
 class DetectionCounts:
     """Counts of detected ends and shafts, except in the entry zone."""
 
-    pairs: int = 0
-    ends: Counter[str] = dataclasses.field(default_factory=Counter)
-    shafts: Counter[str] = dataclasses.field(default_factory=Counter)
-    missing: Counter[str] = dataclasses.field(default_factory=Counter)
+    def __init__(self) -> None:
+        self._pairs = 0
+        self._missing: Counter[str] = Counter()
+        # By the keys of `track_images --json`.
+        ends = {f"{side}_end_seen": 0 for side in SIDES}
+        self._seen = {**ends, **{f"{side}_shaft_seen": 0 for side in SIDES}}
 
     def add(self, measured: Measurement) -> None:
         """Count the result of a pair."""
         cause = missing(measured)
         if cause:
-            self.missing[cause] += 1
+            self._missing[cause] += 1
         if cause == IN_ENTRY_ZONE:
             return
-        self.pairs += 1
+        self._pairs += 1
         for side, end in zip(SIDES, measured.ends, strict=True):
-            self.ends[side] += shows_end(end)
-            self.shafts[side] += shows_shaft(end)
+            self._seen[f"{side}_end_seen"] += shows_end(end)
+            self._seen[f"{side}_shaft_seen"] += shows_shaft(end)
 
     def describe(self) -> str:
         """Return the counts as text."""
         lines = [
-            f"  {side:5}: end seen in {self.ends[side]} of {self.pairs} pairs, "
-            f"shaft in {self.shafts[side]}"
+            f"  {side:5}: end seen in {self._seen[f'{side}_end_seen']} of {self._pairs} pairs, "
+            f"shaft in {self._seen[f'{side}_shaft_seen']}"
             for side in SIDES
         ]
-        lines += [f"  no tip {n:6d} x  {cause}" for cause, n in self.missing.most_common()]
-        if self.missing:
+        lines += [f"  no tip {n:6d} x  {cause}" for cause, n in self._missing.most_common()]
+        if self._missing:
             lines.append("  docs/own_rig.md gives a remedy for each reason")
         return "\n".join(lines)
 
     def figures(self) -> dict[str, JsonValue]:
         """Return the counts by the keys of `track_images --json`."""
-        ends = {f"{side}_end_seen": self.ends[side] for side in SIDES}
-        return {**ends, **{f"{side}_shaft_seen": self.shafts[side] for side in SIDES}}
+        return {**self._seen}
 
 
 class TruthComparison:

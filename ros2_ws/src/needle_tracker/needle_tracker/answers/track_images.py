@@ -18,7 +18,7 @@ from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_js
 from needle_core.commands.csv_files import read_insertions, read_lengths
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
-from needle_core.files.file_access import write_text
+from needle_core.files.file_access import make_folder, write_text
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import missing_section_warning, read_sections, values_for
 from needle_tracker.answers.annotation import annotate, missing
@@ -31,6 +31,7 @@ from needle_tracker.sources.image_files import (
     NamedPair,
     PairSequence,
     Sizes,
+    listed,
     open_pairs,
     progress,
 )
@@ -83,7 +84,6 @@ COLUMNS = (
     *("left_end", "left_shaft", "right_end", "right_shaft", "missing"),
 )
 _NODE = "stereo_tracker"
-_NAMED = 5  # names listed in a warning; the others are only counted
 _NEW_RUN = 10e-3  # change of the insertion between two images that begins a new run [m]
 
 
@@ -101,7 +101,9 @@ def _run(given: argparse.Namespace) -> int:
     pairs = open_pairs(Path(given.left), Path(given.right))
     true = read_lengths(Path(given.truth), ("x_m", "y_m", "z_m")) if given.truth else {}
     truth = TruthComparison(true)
-    overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
+    overlays = None if given.overlay is None else Path(given.overlay).expanduser()
+    if overlays is not None:
+        make_folder(overlays)
     tracker = NeedleTracker(calibration, parameters, parameters.reference(calibration.sizes))
     tracker.warm_up()
     begin = time.perf_counter()
@@ -136,26 +138,24 @@ def _run(given: argparse.Namespace) -> int:
         print(f"drawn: {overlays}")
     warnings = {
         f"{SUSPICION}; exchange --left and --right": swap.suspected,
-        f"{len(pairs.unpaired)} images without a partner: {_named(pairs.unpaired)}": pairs.unpaired,
-        f"{len(unusable)} pairs cannot be used: {_named(unusable)}": unusable,
-        f"{pairs.cut_off} pairs listed in the videos cannot be read": pairs.cut_off,
+        pairs.missing: pairs.missing,
+        f"{len(unusable)} pairs cannot be used: {listed(unusable)}": unusable,
         f"{without} pairs have no insertion": given.insertion and without,
     }
     for warning, holds in warnings.items():
         if holds:
             _warn(warning)
-    if json is not None:
-        result: dict[str, JsonValue] = {
-            "pairs": len(rows),
-            "tips": found,
-            "unpaired": len(pairs.unpaired),
-            "unreadable": len(unusable),
-            "without_insertion": without,
-            **detected.figures(),
-            "wall_s": time.perf_counter() - begin,
-            **(truth.figures() if given.truth else dict.fromkeys(truth.figures())),
-        }
-        write_json(json, result)
+    result: dict[str, JsonValue] = {
+        "pairs": len(rows),
+        "tips": found,
+        "unpaired": len(pairs.unpaired),
+        "unreadable": len(unusable),
+        "without_insertion": without,
+        **detected.figures(),
+        "wall_s": time.perf_counter() - begin,
+        **(truth.figures() if given.truth else dict.fromkeys(truth.figures())),
+    }
+    write_json(json, result)
     return EXIT_DONE
 
 
@@ -221,23 +221,6 @@ def to_row(name: str, measured: Measurement) -> list[str]:
     for end in measured.ends:
         shown += ["", ""] if end is None else [f"{end.ends:.2f}", f"{end.shaft:.2f}"]
     return [name, "0" if cause else "1", *measured_fields, *shown, cause]
-
-
-def _new_folder(name: str, text: str) -> Path:
-    """Create a folder, or accept an empty one; return its path."""
-    folder = Path(text).expanduser()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise UserError(f"{name} {folder}: is not empty; give a new folder")
-    except OSError as error:
-        raise UserError(f"{name} {folder}: {error.strerror}") from error
-    return folder
-
-
-def _named(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
 
 
 def _warn(what: str) -> None:

@@ -13,12 +13,11 @@ from needle_core.messages import (
     Image,
     JointState,
     Point,
-    Pose,
     PoseWithCovariance,
 )
-from needle_tracker.answers.pair_answers import CameraInfoProblem, Frame
-from needle_tracker.optics.calibration import Camera, rotation_matrix
-from needle_tracker.sources.image_encodings import ENCODINGS, SUPPORTED, bytes_per_pixel, grey_image
+from needle_tracker.answers.pair_answers import CameraInfoProblem
+from needle_tracker.optics.calibration import Camera
+from needle_tracker.sources.image_encodings import Frame, decoded
 from needle_tracker.sources.image_files import size_problem
 from needle_tracker.stereo.triangulation import SpatialTip
 
@@ -29,24 +28,10 @@ ROLL_VARIANCE = math.pi**2
 
 
 def frame_of(message: Any, side: str, camera: Camera) -> Frame:
-    """Return the image of a message, or the reason why it is not from this camera.
-
-    The message is an `Image` of needle_core, rclpy or rosbags, which have the same fields.
-    """
-    if message.encoding not in ENCODINGS:
-        return Frame(None, f"{side} image is {message.encoding!r}, expected {SUPPORTED}")
+    """Return the image of a message, or the reason why it is not from this camera."""
     expected = camera.width, camera.height
-    if problem := size_problem(side, (message.width, message.height), expected):
-        return Frame(None, problem)
-    least = message.width * bytes_per_pixel(message.encoding)
-    if message.step < least or len(message.data) != message.step * message.height:
-        return Frame(
-            None,
-            f"{side} image has {len(message.data)} bytes in rows of {message.step}, "
-            f"{message.height} rows of {least} expected",
-        )
-    rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
-    return Frame(grey_image(rows, message.width, message.encoding))
+    problem = size_problem(side, (message.width, message.height), expected)
+    return Frame(None, problem) if problem else decoded(message, side)
 
 
 def image_geometry(message: Any) -> tuple[int, int, NDArray[np.float64]]:
@@ -101,13 +86,6 @@ def tip_pose_message(tip: SpatialTip | None, stamp_ns: int) -> PoseWithCovarianc
         covariance[3:, 3:] = rotation_covariance(tip.direction, tip.direction_covariance)
     values = tuple(covariance.ravel().tolist())
     return PoseWithCovariance(stamp_ns, RIG_FRAME, position, quaternion, values)
-
-
-def rotation_of(pose: Pose | PoseWithCovariance) -> NDArray[np.float64] | None:
-    """Return the rotation matrix of a pose, (3, 3); None if it has no orientation."""
-    quaternion = np.array(pose.orientation)
-    norm = float(np.linalg.norm(quaternion))
-    return rotation_matrix(quaternion / norm) if 0.5 < norm < 2.0 else None
 
 
 def picture_message(pixels: NDArray[np.uint8], stamp_ns: int) -> Image:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -18,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
-from needle_core.files.file_access import write_text
+from needle_core.files.yaml_files import write_yaml
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.calibrating.calibration_outliers import contradictions, misfits
 from needle_tracker.calibrating.calibration_session import (
@@ -31,6 +30,7 @@ from needle_tracker.calibrating.calibration_start import PairsApartError, descri
 from needle_tracker.calibrating.charuco import CharucoBoard, save_figure, write_board
 from needle_tracker.calibrating.imported_lenses import read_lenses
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
+from needle_tracker.calibrating.rig_fit import rms_px
 from needle_tracker.calibrating.rig_model import LENS, SURFACE, unit_of
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, Window
 
@@ -102,7 +102,7 @@ def _run(options: Namespace) -> int:
     options.output = output_file("--output", options.output)
     session = load_session(options.session)
     views, sizes = views_in_folders(options.left, options.right, session)
-    empty = [view.name for view in views if no_board_detected(view) and view.place is None]
+    empty = [view.name for view in views if no_board_detected(view) and view.kind == "free"]
     if empty:
         print(f"left out, no board found: {', '.join(empty)}")
     views = [view for view in views if view.name not in empty]
@@ -111,17 +111,15 @@ def _run(options: Namespace) -> int:
         result = calibrate(views, sizes, session.windows, lenses)
     except PairsApartError as error:
         print(f"NOT OK: {error}; nothing is written")
-        if options.json is not None:
-            write_json(options.json, {"problem": str(error)})
+        write_json(options.json, {"problem": str(error)})
         return EXIT_MISSED
     problems = contradictions(result)
     lines = [*report(result, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
     print("\n".join(lines))
     save_calibration(options.output, result.calibration, lines)
     save_figure(rig_figure(result), options.output.with_suffix(".rig.png"), 130)
-    if options.json is not None:
-        values = figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None}
-        write_json(options.json, values)
+    values = figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None}
+    write_json(options.json, values)
     print(f"written: {options.output}")
     good = not problems and 1e3 * result.tip_error_p95 <= options.goal_mm
     return EXIT_DONE if good else EXIT_MISSED
@@ -129,12 +127,12 @@ def _run(options: Namespace) -> int:
 
 def reprojection_by_kind(result: RigCalibration) -> dict[tuple[str, str], float]:
     """Return the rms reprojection error by camera and kind of view, omitting absent kinds [px]."""
-    kinds = np.array([view.kind for view in result.model.views])
+    kind_of = np.array([view.kind for view in result.model.views])[result.model.view_of]
     return {
-        (side, kind): result.reprojection_rms_px(side, np.flatnonzero(kinds == kind))
+        (side, kind): rms_px(result.fit.residuals[chosen])
         for side in SIDES
         for kind in KINDS
-        if np.any(kinds[result.model.view_of[side]] == kind)
+        if np.any(chosen := result.model.seen_by[side] & (kind_of == kind))
     }
 
 
@@ -142,15 +140,16 @@ def report(result: RigCalibration, goal_mm: float) -> list[str]:
     """Return a calibration as lines of text."""
     kinds = [view.kind for view in result.model.views]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in KINDS)
+    left, right = (np.count_nonzero(result.model.seen_by[side]) for side in SIDES)
     lines = [
-        f"views: {counts}; corners: {len(result.model.pixels['left'])} left, "
-        f"{len(result.model.pixels['right'])} right, each to {result.fit.corner_sigma_px:.3f} px"
+        f"views: {counts}; corners: {left} left, {right} right, "
+        f"each to {result.fit.corner_sigma_px:.3f} px"
     ]
     for (side, kind), error in reprojection_by_kind(result).items():
         lines.append(f"reprojection error, {side} camera, {kind} boards: {error:.3f} px rms")
     if result.apart:
         lines.append(f"WARNING: {describe_apart(result.apart)}; left out")
-    lines += [f"WARNING: {text}" for view, text in misfits(result) if view.place is None]
+    lines += [f"WARNING: {text}" for view, text in misfits(result) if view.kind == "free"]
     if "left.fx" not in result.parameters:
         lines.append("lenses: as given; their error adds to the tip error below")
     for name, found in result.parameters.items():
@@ -256,8 +255,7 @@ def save_calibration(path: Path, calibration: StereoCalibration, comments: list[
                 "layers": [dataclasses.asdict(layer) for layer in window.layers],
                 "inside": float(window.inside),
             }
-    text = yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120)
-    write_text(path, "".join(f"# {line}\n" for line in comments) + text)
+    write_yaml(path, content, comments)
 
 
 def rig_figure(result: RigCalibration) -> Figure:

@@ -9,34 +9,35 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.commands.cli import JsonValue
 from needle_tracker.calibrating.calibration_session import BoardView
-from needle_tracker.calibrating.calibration_start import checked_view, initial_board_poses
+from needle_tracker.calibrating.calibration_start import checked_view
 from needle_tracker.calibrating.rig_fit import (
     LARGEST_MISFIT_PX,
     RigFit,
-    board_parameters_free,
     fit,
     misfit_px,
+    rms_px,
 )
 from needle_tracker.calibrating.rig_model import (
     FIRST_WINDOW,
-    LENS,
+    POSE,
     RigModel,
-    camera_slice,
     tip_error_p95,
-    tip_shifts,
+    tip_shift_p95,
     unit_of,
 )
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 
 Array = NDArray[np.float64]
 
-CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
+CAMERAS = {f"{side}_camera_turned": [f"{side}.{name}" for name in POSE[:3]] for side in SIDES}
+"""Parameters of a turned camera."""
 LEAST_IMPROVEMENT = 30.0  # decrease of chi-squared by one cause: far above noise
 EXPLAINED_PX = 1.0  # largest misfit that still counts as explained by the causes
 TURN_LIMIT = np.deg2rad(0.01)  # a camera with a larger rotation was touched
@@ -127,24 +128,22 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
         A target that one camera does not detect, or that has no known place.
     """
     views = [checked_view(view) for view in views]
-    model = RigModel(calibration, views, initial_board_poses(calibration, views))
+    model = RigModel(calibration, views)
     causes = (*CAMERAS, *model.names[FIRST_WINDOW:])
-    everything = _fit(model, list(causes), None)
+    everything = fit(model, model.start, _parameters(causes))
     sigma = everything.corner_sigma_px
     misfit = misfit_px(model, everything)
-    covariance = everything.covariance[: model.shared, : model.shared]
-    unseen = tip_error_p95(calibration, covariance)
-    asis = _fit(model, [], sigma).residuals.reshape(-1, 2)
-    reprojection = float(np.sqrt(np.mean(np.sum(asis**2, axis=-1))))
+    unseen = tip_error_p95(calibration, everything.covariance)
+    reprojection = rms_px(fit(model, model.start, (), sigma).residuals)
     if not misfit <= EXPLAINED_PX:
         problem = _UNEXPLAINED.format(
             misfit, "another target or place than in the session, left and right exchanged"
         )
         return CheckResult(causes, [], np.nan, unseen, sigma, reprojection, [problem])
     found = _causes(model, causes, sigma)
-    best = _fit(model, found, sigma)
+    best = fit(model, model.start, _parameters(found), sigma)
     deviations = [_deviation(model, best, cause) for cause in found]
-    shift = _p95(calibration, model.calibration(best.parameters))
+    shift = tip_shift_p95(calibration, model.calibration(best.parameters))
     problems = []
     if misfit > LARGEST_MISFIT_PX:
         problems.append(_UNEXPLAINED.format(misfit, "another lens setting, a target not flat"))
@@ -166,9 +165,13 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
 def _causes(model: RigModel, causes: tuple[str, ...], sigma: float) -> list[str]:
     """Return the fewest causes that explain the views, the most significant first."""
     found: list[str] = []
-    cost = _fit(model, found, sigma).cost
+    cost = fit(model, model.start, (), sigma).cost
     while len(found) < len(causes):
-        costs = {c: _fit(model, [*found, c], sigma).cost for c in causes if c not in found}
+        costs = {
+            cause: fit(model, model.start, _parameters([*found, cause]), sigma).cost
+            for cause in causes
+            if cause not in found
+        }
         best = min(costs, key=lambda cause: costs[cause])
         if 2.0 * (cost - costs[best]) < LEAST_IMPROVEMENT:
             break
@@ -177,23 +180,13 @@ def _causes(model: RigModel, causes: tuple[str, ...], sigma: float) -> list[str]
     return found
 
 
-def _fit(model: RigModel, causes: list[str], sigma: float | None) -> RigFit:
-    free = board_parameters_free(model)
-    for cause in causes:
-        free[_columns(model, cause)] = True
-    return fit(model, model.start, free, sigma)
-
-
-def _columns(model: RigModel, cause: str) -> list[int]:
-    """Return the parameter indices of a cause: rotation of a camera, or a window parameter."""
-    if cause in CAMERAS:
-        start = camera_slice(SIDES[CAMERAS.index(cause)]).start + len(LENS)
-        return [start, start + 1, start + 2]
-    return [model.names.index(cause)]
+def _parameters(causes: Iterable[str]) -> list[str]:
+    """Return the parameters of causes: rotations of cameras, and those of the windows."""
+    return [name for cause in causes for name in CAMERAS.get(cause, [cause])]
 
 
 def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
-    columns = _columns(model, cause)
+    columns = [model.names.index(name) for name in _parameters([cause])]
     change = (best.parameters - model.start)[columns]
     length = float(np.linalg.norm(change))
     towards = change / max(length, 1e-12)
@@ -201,12 +194,8 @@ def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
     size = length if cause in CAMERAS else float(change[0])
     alone = model.start.copy()
     alone[columns] = best.parameters[columns]
-    error = _p95(model.calibration(model.start), model.calibration(alone))
+    error = tip_shift_p95(model.calibration(model.start), model.calibration(alone))
     return Deviation(cause, size, sigma, error)
-
-
-def _p95(assumed: StereoCalibration, true: StereoCalibration) -> float:
-    return float(np.percentile(np.linalg.norm(tip_shifts(assumed, true), axis=-1), 95.0))
 
 
 def report(result: CheckResult) -> str:

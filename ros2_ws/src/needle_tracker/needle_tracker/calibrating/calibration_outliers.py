@@ -13,11 +13,7 @@ from numpy.typing import NDArray
 from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.calibration_start import describe_apart
 from needle_tracker.calibrating.rig_calibration import RigCalibration
-from needle_tracker.calibrating.rig_fit import (
-    LARGEST_MISFIT_PX,
-    misfit_px,
-    place_deviations,
-)
+from needle_tracker.calibrating.rig_fit import LARGEST_MISFIT_PX, misfit_px, rms_px
 from needle_tracker.optics.calibration import SIDES
 
 Array = NDArray[np.float64]
@@ -37,8 +33,8 @@ def contradictions(result: RigCalibration) -> list[str]:
     result : RigCalibration
         The calibration.
     """
-    found = [text for view, text in misfits(result) if view.place is not None]
-    if any(view.place is not None for view in result.apart):
+    found = [text for view, text in misfits(result) if view.kind != "free"]
+    if any(view.kind != "free" for view in result.apart):
         found.insert(0, describe_apart(result.apart))
     cause = "its lens has more distortion than k1, k2, k3, p1 and p2 describe"
     if "left.fx" not in result.parameters:
@@ -60,7 +56,7 @@ def contradictions(result: RigCalibration) -> list[str]:
             f"{'larger' if error > 0.0 else 'smaller'} than in the session (tip errors scale with "
             "it): measure them again, and the places in air"
         )
-    for name, distance, pull in place_deviations(result.model, result.fit):
+    for name, distance, pull in _place_deviations(result):
         if pull > LARGEST_PULL:
             found.append(
                 f"{name} is {1e3 * distance:.2f} mm ({pull:.0f} standard deviations) from "
@@ -77,12 +73,14 @@ def misfits(result: RigCalibration) -> list[tuple[BoardView, str]]:
     result : RigCalibration
         The calibration.
     """
+    model, residuals = result.model, result.fit.residuals
     errors = [
-        (view, side, result.reprojection_rms_px(side, number))
-        for number, view in enumerate(result.model.views)
+        (view, side, rms_px(residuals[model.seen_by[side] & (model.view_of == number)]))
+        for number, view in enumerate(model.views)
         for side in SIDES
     ]
-    typical = float(np.median([error for _, _, error in errors]))
+    # A camera that does not see a board has no error.
+    typical = float(np.nanmedian([error for _, _, error in errors]))
     return [
         (
             view,
@@ -107,12 +105,32 @@ def ring_patterns(result: RigCalibration) -> dict[str, float]:
     """
     found = {}
     for side, camera in result.calibration.cameras.items():
-        outwards = result.model.pixels[side] - camera.camera_matrix[:2, 2]
+        own = result.model.seen_by[side]
+        outwards = result.model.pixels[own] - camera.camera_matrix[:2, 2]
         radii = np.linalg.norm(outwards, axis=-1)
-        radial = np.sum(result.residuals(side) * outwards, axis=-1) / np.maximum(radii, 1.0)
+        radial = np.sum(result.fit.residuals[own] * outwards, axis=-1) / np.maximum(radii, 1.0)
         rings = np.array_split(radial[np.argsort(radii)], _RINGS)
         means = np.array([np.mean(ring) for ring in rings])
         errors = np.array([np.std(ring) / np.sqrt(len(ring)) for ring in rings])
         if np.any((np.abs(means) > _RING_SIGMAS * errors) & (np.abs(means) > _LEAST_PATTERN_PX)):
             found[side] = float(np.abs(means).max())
     return found
+
+
+def _place_deviations(result: RigCalibration) -> list[tuple[str, float, float]]:
+    """Return the deviations of boards from places with a standard deviation.
+
+    Each has the name of the view; the deviation of the centre of the board [m]; the largest
+    deviation of its six parameters in standard deviations.
+    """
+    model, parameters = result.model, result.fit.parameters
+    poses = model.board_poses(parameters)
+    deviations = []
+    for number, view in enumerate(model.views):
+        if 0.0 < view.place.sigma < np.inf:
+            own = slice(model.shared + 6 * number, model.shared + 6 * (number + 1))
+            pull = np.abs(parameters[own] / model.given_sigma[own]).max()
+            middle = np.append(view.left.points.mean(axis=0), 1.0)
+            away = np.linalg.norm((poses[number] - view.place.T_rig_board) @ middle)
+            deviations.append((view.name, float(away), float(pull)))
+    return deviations

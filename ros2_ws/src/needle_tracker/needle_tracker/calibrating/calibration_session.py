@@ -60,6 +60,10 @@ class Place:
         return math.isfinite(self.sigma)
 
 
+HELD_FREELY = Place(np.eye(4), sigma=math.inf)
+"""Place of a board held freely in air."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Corners:
     """Corners detected by one camera: in the board's frame [m] (n, 3), and in pixels (n, 2)."""
@@ -70,10 +74,10 @@ class Corners:
 
 @dataclasses.dataclass(frozen=True)
 class BoardView:
-    """One exposure of the board by both cameras; `place` is None if it was held freely."""
+    """One exposure of the board by both cameras."""
 
     name: str
-    place: Place | None
+    place: Place
     left: Corners
     right: Corners
 
@@ -88,16 +92,11 @@ class BoardView:
         return dataclasses.replace(self, left=left, right=right)
 
     @property
-    def under_surface(self) -> bool:
-        """Whether the board was in the phantom."""
-        return self.place is not None and self.place.under_surface
-
-    @property
     def kind(self) -> str:
         """Kind of view in `KINDS`: held freely, at a known place in air, or in the phantom."""
-        if self.place is None:
-            return "free"
-        return "under" if self.under_surface else "surface"
+        if self.place.under_surface:
+            return "under"
+        return "surface" if self.place.is_known else "free"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,8 +117,8 @@ class Session:
     windows: tuple[Window, Window]
     places: dict[str, Place]
 
-    def place_of(self, *names: str) -> Place | None:
-        """Return the place of the board in an image; None if it was held freely.
+    def place_of(self, *names: str) -> Place:
+        """Return the place of the board in an image, `HELD_FREELY` if the session has none.
 
         Parameters
         ----------
@@ -128,7 +127,7 @@ class Session:
         """
         exact = [name for name in names if name in self.places]
         like = [key for key in self.places if any(fnmatch.fnmatchcase(n, key) for n in names)]
-        return next((self.places[key] for key in exact + like), None)
+        return next((self.places[key] for key in exact + like), HELD_FREELY)
 
 
 def load_session(path: Path) -> Session:
@@ -182,7 +181,7 @@ def parse_session(content: Any) -> Session:
     content = top.get("places") or {}
     if not isinstance(content, dict):
         raise UserError(f"places = {content!r} is not a mapping of file names")
-    board = _board(top.get("board"))
+    board = _board(top)
     places = {str(name): _place(value, f"places.{name}") for name, value in content.items()}
     for name, place in places.items():
         if place.is_known:
@@ -216,11 +215,9 @@ def _check_side(
         )
 
 
-def _board(content: Any) -> CharucoBoard:
-    board = _mapping(content, "board", _BOARD_KEYS)
-    columns, rows, square, marker = (
-        number({"board": board}, "board", key) for key in _BOARD_KEYS[:4]
-    )
+def _board(top: dict[str, Any]) -> CharucoBoard:
+    board = _mapping(top.get("board"), "board", _BOARD_KEYS)
+    columns, rows, square, marker = (number(top, "board", key) for key in _BOARD_KEYS[:4])
     if not (columns.is_integer() and rows.is_integer()):
         raise UserError(f"board.columns, board.rows = {columns:g}, {rows:g} are not whole numbers")
     legacy = _flag(board, "board", "legacy")
@@ -319,7 +316,7 @@ def no_board_detected(view: BoardView) -> bool:
     return not np.any([len(view.corners(side).points) for side in SIDES])
 
 
-def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) -> BoardView:
+def averaged_view(name: str, session: Session, pairs: list[tuple[Image, Image]]) -> BoardView:
     """Return the view of a board at rest, from the mean of several exposures.
 
     Parameters
@@ -328,14 +325,13 @@ def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) ->
         Name of the view, by which the session gives the place of the board.
     session : Session
         Board and places.
-    pairs : list of dict of str to ndarray
+    pairs : list of (ndarray, ndarray)
         Left and right images.
     """
-    left, right = (
-        np.rint(np.mean([images[side] for images in pairs], axis=0)).astype(np.uint8)
-        for side in SIDES
+    means = (
+        np.rint(np.mean(images, axis=0)).astype(np.uint8) for images in zip(*pairs, strict=True)
     )
-    corners = (_corners_in(image, session.board) for image in (left, right))
+    corners = (_corners_in(image, session.board) for image in means)
     view = BoardView(name, session.place_of(name), *corners)
     if no_board_detected(view):
         raise _no_board(session)

@@ -14,16 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.calibration_session import BoardView, Corners, Place
-from needle_tracker.calibrating.rig_fit import board_parameters_free, fit
-from needle_tracker.calibrating.rig_model import LENS, RigModel, camera_slice
+from needle_tracker.calibrating.calibration_session import HELD_FREELY, BoardView, Corners, Place
+from needle_tracker.calibrating.rig_fit import fit
+from needle_tracker.calibrating.rig_model import POSE, RigModel, board_pose, initial_board_poses
 from needle_tracker.optics.calibration import (
     LEAST_BASELINE,
     SIDES,
     Camera,
     StereoCalibration,
     Window,
-    pose_matrix,
 )
 
 Array = NDArray[np.float64]
@@ -62,9 +61,9 @@ def checked_views(
     UserError
         Too few views or corners, a board that only one camera sees, or no board at a known place.
     """
-    checked = [checked_view(v, alone=surface is None and v.place is None) for v in views]
+    checked = [checked_view(v, alone=surface is None and v.kind == "free") for v in views]
     for side in SIDES:
-        free = [v for v in checked if v.place is None and len(v.corners(side).points)]
+        free = [v for v in checked if v.kind == "free" and len(v.corners(side).points)]
         if len(free) < least_free:
             raise UserError(
                 f"{len(free)} views of the board held freely in air"
@@ -101,8 +100,8 @@ def checked_view(view: BoardView, *, alone: bool = False) -> BoardView:
 
 def anchor_view(views: list[BoardView], surface: Window | None) -> BoardView | None:
     """Return the view that defines `rig`: preferably in air; with a common surface, only in air."""
-    known = [view for view in views if view.place and view.place.is_known]
-    in_air = [view for view in known if not view.under_surface]
+    known = [view for view in views if view.place.is_known]
+    in_air = [view for view in known if not view.place.under_surface]
     return next(iter(in_air if surface else in_air + known), None)
 
 
@@ -132,7 +131,7 @@ def calibrate_lenses(
     """
     cameras = []
     for side, window in zip(SIDES, windows, strict=True):
-        in_air = [view.corners(side) for view in views if not view.under_surface]
+        in_air = [view.corners(side) for view in views if not view.place.under_surface]
         lens = _lens([corners for corners in in_air if len(corners.points)], side, sizes[side])
         cameras.append(Camera(*sizes[side], *lens, np.eye(4), window))
     return StereoCalibration(*cameras)
@@ -143,9 +142,7 @@ def are_posed(cameras: StereoCalibration) -> bool:
     return bool(np.linalg.norm(cameras.right.centre - cameras.left.centre) >= LEAST_BASELINE)
 
 
-def first_calibration(
-    views: list[BoardView], cameras: StereoCalibration
-) -> tuple[StereoCalibration, Array]:
+def first_calibration(views: list[BoardView], cameras: StereoCalibration) -> StereoCalibration:
     """Return a calibration to start the adjustment from.
 
     A board at a known place defines `rig`; windows are ignored.
@@ -159,10 +156,8 @@ def first_calibration(
 
     Returns
     -------
-    calibration : StereoCalibration
+    StereoCalibration
         Initial values.
-    boards : ndarray, shape (len(views), 4, 4)
-        T_rig_board of each view.
 
     Raises
     ------
@@ -171,7 +166,6 @@ def first_calibration(
     """
     anchor = anchor_view(views, cameras.surface)
     assert anchor is not None
-    assert anchor.place is not None
     placed: list[Camera] = []
     for side, alone in cameras.cameras.items():
         board = board_pose(alone, anchor.corners(side))
@@ -187,29 +181,7 @@ def first_calibration(
                 f"the place given for {anchor.name} is wrong"
             )
         placed.append(camera)
-    calibration = StereoCalibration(*placed)
-    return calibration, initial_board_poses(calibration, views)
-
-
-def initial_board_poses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
-    """Return T_rig_board of each view, shape (n, 4, 4): as given, else from one camera.
-
-    Parameters
-    ----------
-    calibration : StereoCalibration
-        Cameras; the windows are ignored.
-    views : list of BoardView
-        Views, each with the corners of at least one camera.
-    """
-    boards = []
-    for view in views:
-        if view.place is not None and view.place.is_known:
-            boards.append(view.place.T_rig_board)
-            continue
-        side = next(side for side in SIDES if len(view.corners(side).points))
-        camera = calibration.cameras[side]
-        boards.append(np.linalg.inv(camera.T_optical_rig) @ board_pose(camera, view.corners(side)))
-    return np.stack(boards)
+    return StereoCalibration(*placed)
 
 
 def _lens(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Array, Array]:
@@ -238,19 +210,6 @@ def _lens(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Arr
             f"{LEAST_TILT_DEG:g} needed, 30 to 45 are good): tilt the board"
         )
     return np.asarray(matrix, dtype=np.float64), np.asarray(distortion).reshape(-1)[:5].copy()
-
-
-def board_pose(camera: Camera, corners: Corners) -> Array:
-    """Return the pose of the board in the optical frame, shape (4, 4), without refraction."""
-    _, rotation, translation = cv2.solvePnP(
-        corners.points,
-        corners.pixels,
-        camera.camera_matrix,
-        camera.distortion,
-        flags=cv2.SOLVEPNP_IPPE,
-    )
-    turn = np.asarray(cv2.Rodrigues(np.asarray(rotation).reshape(3))[0], dtype=np.float64)
-    return pose_matrix(turn, np.asarray(translation).reshape(3))
 
 
 class PairsApartError(UserError):
@@ -308,14 +267,18 @@ def describe_apart(views: list[BoardView]) -> str:
 
 def _apart(views: list[BoardView], cameras: StereoCalibration) -> tuple[list[str], Array | None]:
     both = [view for view in views if all(len(view.corners(side).points) for side in SIDES)]
-    in_air = [dataclasses.replace(view, place=None) for view in both if not view.under_surface]
+    in_air = [
+        dataclasses.replace(view, place=HELD_FREELY)
+        for view in both
+        if not view.place.under_surface
+    ]
     if not in_air:
         return [], None
     apart, pose = _apart_in_air(cameras, in_air)
     kept = [view for view in views if view.name not in apart]
     if cameras.surface is not None and anchor_view(kept, cameras.surface) is not None:
-        calibration, _ = first_calibration(kept, _posed(cameras, pose))
-        for view in (view for view in both if view.under_surface):
+        calibration = first_calibration(kept, _posed(cameras, pose))
+        for view in (view for view in both if view.place.under_surface):
             alike = [dataclasses.replace(view, place=Place(np.eye(4), True, np.inf))]
             if _misses(calibration, alike) > 2.0 * _alone(calibration, alike) + _SLACK_UNDER_PX:
                 apart.append(view.name)
@@ -341,10 +304,9 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
     pose, near = poses[best], away[best] <= 3.0 * nearest[best]
     for _ in range(_ROUNDS):
         kept = [view for view, is_near in zip(views, near, strict=True) if is_near]
-        model = RigModel(_posed(cameras, pose), kept, left[near])
-        free = board_parameters_free(model)
-        free[camera_slice("right")][len(LENS) :] = True
-        parameters = fit(model, model.start, free).parameters
+        model = RigModel(_posed(cameras, pose), kept)
+        names = [f"right.{name}" for name in POSE]
+        parameters = fit(model, model.start, names).parameters
         pose = model.calibration(parameters).right.T_optical_rig
         was, near = near, _misses(_posed(cameras, pose), views) <= limits
         if np.array_equal(near, was) or not np.any(near):
@@ -354,11 +316,8 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
 
 def _posed(cameras: StereoCalibration, pose: Array) -> StereoCalibration:
     """Return the cameras with the left one at the origin, the right one at T_right_left."""
-    left, right = (
-        dataclasses.replace(camera, T_optical_rig=transform)
-        for camera, transform in ((cameras.left, np.eye(4)), (cameras.right, pose))
-    )
-    return StereoCalibration(left, right)
+    left = dataclasses.replace(cameras.left, T_optical_rig=np.eye(4))
+    return StereoCalibration(left, dataclasses.replace(cameras.right, T_optical_rig=pose))
 
 
 def _alone(calibration: StereoCalibration, views: list[BoardView]) -> Array:
@@ -369,11 +328,8 @@ def _alone(calibration: StereoCalibration, views: list[BoardView]) -> Array:
 
 def _misses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
     """Return the rms corner error of each view at the best-fitting pose of the board [px]."""
-    model = RigModel(calibration, views, initial_board_poses(calibration, views))
-    free = board_parameters_free(model)
-    if any(view.under_surface for view in views):
-        # With one flat board, index and height of the surface are indistinguishable.
-        free[model.names.index("refractive_index")] = True
-    squares = np.sum(fit(model, model.start, free).residuals.reshape(-1, 2) ** 2, axis=-1)
-    of_view = np.concatenate([model.view_of[side] for side in SIDES])
-    return np.sqrt(np.bincount(of_view, squares) / np.bincount(of_view))
+    model = RigModel(calibration, views)
+    # With one flat board, index and height of the surface are indistinguishable.
+    names = ["refractive_index"] if any(view.place.under_surface for view in views) else []
+    squares = np.sum(fit(model, model.start, names).residuals ** 2, axis=-1)
+    return np.sqrt(np.bincount(model.view_of, squares) / np.bincount(model.view_of))

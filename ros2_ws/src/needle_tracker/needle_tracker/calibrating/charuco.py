@@ -80,11 +80,6 @@ class CharucoBoard:
         )
 
     @property
-    def size(self) -> tuple[float, float]:
-        """Length along x and y [m]."""
-        return self.columns * self.square, self.rows * self.square
-
-    @property
     def corners(self) -> Array:
         """Inner corners in the frame of the board [m], shape ((columns-1)*(rows-1), 3)."""
         v, u = np.mgrid[1 : self.rows, 1 : self.columns]
@@ -155,28 +150,17 @@ def write_board(board: CharucoBoard, path: Path) -> None:
     """
     if path.suffix.lower() not in (".pdf", ".png"):
         raise UserError(f"--board {path}: must end in .pdf or .png")
-    length, height = board.size
-    paper = (length + 2 * _MARGIN, height + 2 * _MARGIN)
-    figure = Figure(figsize=(paper[0] / _INCH, paper[1] / _INCH))
-    axes = figure.add_axes(
-        (_MARGIN / paper[0], _MARGIN / paper[1], length / paper[0], height / paper[1])
-    )
+    pixel = board.square / _SQUARE_PX
+    page = np.pad(board.drawing(_SQUARE_PX), round(_MARGIN / pixel), constant_values=255)
+    height, width = (pixel * length / _INCH for length in page.shape)
+    figure = Figure(figsize=(width, height))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.axis("off")
     # A PDF embeds the drawing at its exact size; a PNG would round its edges to whole dots.
-    axes.imshow(
-        board.drawing(_SQUARE_PX),
-        cmap="gray",
-        extent=(0.0, length, height, 0.0),
-        interpolation="none" if path.suffix.lower() == ".pdf" else "bilinear",
-        aspect="auto",
-    )
-    figure.text(
-        0.5,
-        0.25 * _MARGIN / paper[1],
-        f"{board}; origin: top left corner of the pattern",
-        ha="center",
-        fontsize=6,
-    )
+    interpolation = "none" if path.suffix.lower() == ".pdf" else "bilinear"
+    axes.imshow(page, cmap="gray", interpolation=interpolation, aspect="auto")
+    caption = f"{board}; origin: top left corner of the pattern"
+    figure.text(0.5, 0.25 * _MARGIN / _INCH / height, caption, ha="center", fontsize=6)
     save_figure(figure, path, _PRINT_DPI)
 
 

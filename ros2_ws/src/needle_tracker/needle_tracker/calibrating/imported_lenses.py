@@ -19,6 +19,7 @@ from needle_tracker.optics.calibration import (
     StereoCalibration,
     Window,
     check_camera_matrix,
+    number,
     numbers,
     pose_matrix,
     value_of,
@@ -38,12 +39,10 @@ _LARGEST_SKEW = 1e-3  # error of the singular values of a rotation: files have f
 
 
 class _Lens(NamedTuple):
-    """Camera in a file; `size` may be missing."""
+    """Camera in a file: matrix, k1, k2, p1, p2, k3, and the size of its images if given."""
 
-    path: Path
     matrix: Array
-    model: str
-    coefficients: Array
+    distortion: Array
     size: tuple[int, int] | None
 
 
@@ -98,12 +97,12 @@ def read_lenses(
     for side, lens, window in zip(SIDES, lenses, windows, strict=True):
         if lens.size is not None and lens.size != sizes[side]:
             raise UserError(
-                f"--lenses {lens.path} is for images of {lens.size[0]}x{lens.size[1]}, the {side} "
-                f"ones are {sizes[side][0]}x{sizes[side][1]}"
+                f"--lenses: the {side} camera is for images of {lens.size[0]}x{lens.size[1]}, the "
+                f"{side} ones are {sizes[side][0]}x{sizes[side][1]}"
             )
-        check_camera_matrix(f"--lenses {lens.path}, {side} camera", lens.matrix)
+        check_camera_matrix(f"--lenses: {side} camera", lens.matrix)
         pose = poses[0] if poses and cameras else np.eye(4)
-        cameras.append(Camera(*sizes[side], lens.matrix, _plumb_bob(lens), pose, window))
+        cameras.append(Camera(*sizes[side], lens.matrix, lens.distortion, pose, window))
     return StereoCalibration(*cameras)
 
 
@@ -112,10 +111,10 @@ def _read(path: Path) -> _Found:
     kind = foreign_format(text)
     try:
         if kind == OPENCV:
-            return _opencv(text, path)
+            return _opencv(text)
         if kind in (KALIBR, ROS):
             content = next(iter(yaml.safe_load_all(text)))
-            return _kalibr(content, path) if kind == KALIBR else _camera_info(content, path)
+            return _kalibr(content) if kind == KALIBR else _camera_info(content)
     except yaml.YAMLError as error:
         raise UserError(f"--lenses {path} is not YAML: {' '.join(str(error).split())}") from error
     except UserError as error:
@@ -123,15 +122,15 @@ def _read(path: Path) -> _Found:
     raise UserError(f"--lenses {path} is neither {ROS}, {KALIBR} nor {OPENCV}")
 
 
-def _camera_info(content: Any, path: Path) -> _Found:
-    lens = _one_camera(content, path, str(content.get("distortion_model")))
+def _camera_info(content: Any) -> _Found:
+    lens = _one_camera(content, str(content.get("distortion_model")))
     rotation = numbers(content, 9, "rectification_matrix", "data").reshape(3, 3)
     projection = numbers(content, 12, "projection_matrix", "data").reshape(3, 4)
     shift = np.append(projection[:2, 3] / np.maximum(np.diag(projection)[:2], 1e-9), 0.0)
     return _Found([lens], rectified=_transform(rotation, -shift))
 
 
-def _kalibr(content: Any, path: Path) -> _Found:
+def _kalibr(content: Any) -> _Found:
     lenses = []
     for name in sorted(content)[: len(SIDES)]:
         camera = value_of(content, name, "camera_model")
@@ -140,16 +139,16 @@ def _kalibr(content: Any, path: Path) -> _Found:
         fx, fy, cx, cy = numbers(content, 4, name, "intrinsics")
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         model = str(value_of(content, name, "distortion_model"))
-        coefficients = numbers(content, None, name, "distortion_coeffs")
+        distortion = _distortion(content, model, name, "distortion_coeffs")
         width, height = map(int, numbers(content, 2, name, "resolution"))
-        lenses.append(_Lens(path, matrix, model, coefficients, (width, height)))
+        lenses.append(_Lens(matrix, distortion, (width, height)))
     if len(lenses) < len(SIDES):
         return _Found(lenses)
     pose = numbers(content, 16, name, "T_cn_cnm1").reshape(4, 4)
     return _Found(lenses, _transform(pose[:3, :3], pose[:3, 3]))
 
 
-def _opencv(text: str, path: Path) -> _Found:
+def _opencv(text: str) -> _Found:
     """Return the content of a file by OpenCV's sample `stereo_calib` (two files) or `calibration`.
 
     Other programs name the matrices after the parameters of `stereoCalibrate`.
@@ -164,23 +163,23 @@ def _opencv(text: str, path: Path) -> _Found:
     except (AttributeError, SystemError, cv2.error) as error:
         raise UserError("it is damaged") from error
     lenses = [
-        _Lens(path, _matrix(content, key), _PLUMB_BOB, numbers(content, None, other, "data"), None)
-        for number in "12"
-        for key, other in ((m + number, d + number) for m, d in _OPENCV_KEYS)
+        _Lens(_matrix(content, key), _distortion(content, _PLUMB_BOB, other, "data"), None)
+        for suffix in "12"
+        for key, other in ((m + suffix, d + suffix) for m, d in _OPENCV_KEYS)
         if key in content
     ]
     if "camera_matrix" in content:
         model = "fisheye" if content.get("fisheye_model") else _PLUMB_BOB
-        lenses.append(_one_camera(content, path, model))
+        lenses.append(_one_camera(content, model))
     if "R" not in content:
         return _Found(lenses)
     return _Found(lenses, _transform(_matrix(content, "R"), numbers(content, 3, "T", "data")))
 
 
-def _one_camera(content: Any, path: Path, model: str) -> _Lens:
-    width, height = (int(value_of(content, f"image_{name}")) for name in ("width", "height"))
-    coefficients = numbers(content, None, "distortion_coefficients", "data")
-    return _Lens(path, _matrix(content, "camera_matrix"), model, coefficients, (width, height))
+def _one_camera(content: Any, model: str) -> _Lens:
+    width, height = (int(number(content, f"image_{name}")) for name in ("width", "height"))
+    distortion = _distortion(content, model, "distortion_coefficients", "data")
+    return _Lens(_matrix(content, "camera_matrix"), distortion, (width, height))
 
 
 def _matrix(content: Any, key: str) -> Array:
@@ -194,12 +193,12 @@ def _transform(rotation: Array, translation: Array) -> Array:
     return pose_matrix(left @ right, translation)
 
 
-def _plumb_bob(lens: _Lens) -> Array:
-    """Return k1, k2, p1, p2, k3 of a lens, shape (5,)."""
-    coefficients = lens.coefficients
-    if lens.model not in _MODELS or 0 < len(coefficients) < 4 or np.any(coefficients[5:]):
+def _distortion(content: Any, model: str, *keys: str) -> Array:
+    """Return k1, k2, p1, p2, k3, shape (5,), under a path of keys."""
+    coefficients = numbers(content, None, *keys)
+    if model not in _MODELS or 0 < len(coefficients) < 4 or np.any(coefficients[5:]):
         raise UserError(
-            f"--lenses {lens.path}: distortion model {lens.model} with {len(coefficients)} "
-            f"coefficients is not supported: {_CURE}"
+            f"distortion model {model} with {len(coefficients)} coefficients is not supported: "
+            f"{_CURE}"
         )
     return np.append(coefficients, np.zeros(5))[:5]

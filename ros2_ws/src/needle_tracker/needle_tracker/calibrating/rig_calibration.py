@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import numpy.typing as npt
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
@@ -24,7 +23,6 @@ from needle_tracker.calibrating.calibration_start import (
 from needle_tracker.calibrating.rig_fit import (
     LEAST_CORNER_SIGMA_PX,
     RigFit,
-    board_parameters_free,
     fit,
 )
 from needle_tracker.calibrating.rig_model import (
@@ -33,11 +31,9 @@ from needle_tracker.calibrating.rig_model import (
     POSE,
     SQUARES,
     RigModel,
-    camera_slice,
     tip_error_p95,
 )
 from needle_tracker.optics.calibration import (
-    LEAST_BASELINE,
     SIDES,
     StereoCalibration,
     Window,
@@ -106,25 +102,6 @@ class RigCalibration:
     tip_error_p95: float
     apart: list[BoardView]
 
-    def reprojection_rms_px(self, side: str, views: npt.ArrayLike) -> float:
-        """Return the reprojection error of a camera over some views [px].
-
-        Parameters
-        ----------
-        side : str
-            "left" or "right".
-        views : int or array_like of int
-            Numbers of the views.
-        """
-        errors = self.residuals(side)[np.isin(self.model.view_of[side], views)]
-        return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else np.nan
-
-    def residuals(self, side: str) -> Array:
-        """Return measured minus fitted corners of one camera, shape (n, 2) [px]."""
-        count = 2 * len(self.model.pixels["left"])
-        part = self.fit.residuals[:count] if side == "left" else self.fit.residuals[count:]
-        return part.reshape(-1, 2)
-
 
 def calibrate(
     views: list[BoardView],
@@ -162,55 +139,49 @@ def calibrate(
     tied = are_posed(cameras)
     if tied and relative_pose is not None:
         _check_relative_pose(cameras.right.T_optical_rig, relative_pose)
-    start, boards = first_calibration(views, cameras)
-    model = RigModel(start, views, boards, tied=tied)
-    names = list(model.names)
-    # Values of undetermined parameters: windows as given, a lens without distortion.
-    given = model.start[: model.shared].copy()
-    given[[name.split(".")[-1] in LENS[4:] for name in names]] = 0.0
-    free = board_parameters_free(model)
-    # The initial values ignore refraction: without a board at a known place in air, fit the poses
-    # of cameras and boards first.
-    poses = free.copy()
-    poses[: model.shared] = [name.split(".")[-1] in POSE for name in names]
-    poses[camera_slice("right")] &= not tied
-    free[: model.shared] = True
-    free[SQUARES] = False
-    if lenses is not None:
-        free[:FIRST_WINDOW] = poses[:FIRST_WINDOW]
-    if not any(view.under_surface for view in views):
-        free[FIRST_WINDOW : model.shared] = False
+    start = first_calibration(views, cameras)
+    model = RigModel(start, views, tied=tied)
+    names = model.names
+    kinds = {name: name.split(".")[-1] for name in names}
+    # With a given relative pose, the right camera moves with the left one.
+    poses = {n for n, kind in kinds.items() if kind in POSE and not (tied and n[:5] == "right")}
+    lens = [name for name, kind in kinds.items() if kind in LENS and lenses is None]
+    surface = names[FIRST_WINDOW:]
+    is_under = any(view.place.under_surface for view in views)
+    free = {*poses, *lens, *(surface if is_under else ())}
     sigmas = dict.fromkeys(names, np.inf)
     parameters = model.start
     if start.surface is None:
+        # The initial values ignore refraction: without a board at a known place in air, fit the
+        # poses of cameras and boards first.
         parameters = fit(model, parameters, poses, _FIRST_SIGMA_PX).parameters
     while True:
         result = fit(model, parameters, free)
-        fitted = dict(zip(names, result.sigma[: model.shared], strict=True))
-        sigmas.update({name: fitted[name] for i, name in enumerate(names) if free[i]})
+        fitted = zip(names, result.sigma, strict=False)
+        sigmas |= {name: sigma for name, sigma in fitted if name in free}
         worst = _least_determined(names, result)
         if worst is None:
             break
-        parameters = result.parameters.copy()
-        parameters[worst] = given[worst]
-        free[worst] = False
+        # As given: a window of the session, a lens without distortion.
+        parameters, i = result.parameters.copy(), names.index(worst)
+        parameters[i] = 0.0 if worst in lens else model.start[i]
+        free.remove(worst)
     centre_limit = _OWN_WINDOWS_CENTRE_LIMIT if start.surface is None else _FOCAL_LIMIT
     _check_cameras(names, result, sizes, centre_limit)
     calibration = model.calibration(result.parameters)
-    if np.linalg.norm(calibration.left.centre - calibration.right.centre) < LEAST_BASELINE:
+    if not are_posed(calibration):
         raise UserError(
             "both cameras are estimated at one place: are left and right the same images?"
         )
     determined = {
-        name: Determined(float(result.parameters[i]), float(sigmas[name]), not free[i])
-        for i, name in enumerate(names)
-        if i >= FIRST_WINDOW or (lenses is None and name.split(".")[-1] in LENS)
+        name: Determined(
+            float(result.parameters[names.index(name)]), float(sigmas[name]), name not in free
+        )
+        for name in (*lens, *surface)
     }
-    shared = result.covariance[: model.shared, : model.shared]
-    tip_error = tip_error_p95(calibration, shared, tied=tied)
-    free[SQUARES] = True
+    tip_error = tip_error_p95(calibration, result.covariance, tied=tied)
     corner_sigma = max(result.corner_sigma_px, LEAST_CORNER_SIGMA_PX)
-    other = fit(model, result.parameters, free, corner_sigma)
+    other = fit(model, result.parameters, free | {"square_size"}, corner_sigma)
     size = float(other.parameters[SQUARES]), float(other.sigma[SQUARES])
     return RigCalibration(calibration, result, model, determined, size, tip_error, apart)
 
@@ -229,17 +200,17 @@ def _check_relative_pose(given: Array, found: Array) -> None:
         )
 
 
-def _least_determined(names: list[str], result: RigFit) -> int | None:
+def _least_determined(names: tuple[str, ...], result: RigFit) -> str | None:
     """Return the free parameter that is farthest above its limit, if any."""
     limits = np.array([LIMITS.get(name.split(".")[-1], np.inf) for name in names])
     # The standard deviation of a fixed parameter is 0.
     ratios = result.sigma[: len(names)] / limits
     worst = int(ratios.argmax())
-    return worst if ratios[worst] > 1.0 else None
+    return names[worst] if ratios[worst] > 1.0 else None
 
 
 def _check_cameras(
-    names: list[str], result: RigFit, sizes: dict[str, tuple[int, int]], centre_limit: float
+    names: tuple[str, ...], result: RigFit, sizes: dict[str, tuple[int, int]], centre_limit: float
 ) -> None:
     for side in SIDES:
         for name in ("fx", "fy", "cx", "cy"):

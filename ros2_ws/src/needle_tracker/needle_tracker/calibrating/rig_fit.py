@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +31,9 @@ class RigFit:
     ----------
     parameters : ndarray, shape (p,)
         All parameters, including fixed ones.
-    free : ndarray of bool, shape (p,)
-        Fitted parameters.
     covariance : ndarray, shape (p, p)
         Covariance of the parameters; 0 for fixed ones.
-    residuals : ndarray, shape (2 * corners,)
+    residuals : ndarray, shape (n, 2)
         Measured minus fitted pixels [px].
     corner_sigma_px : float
         Standard deviation of the coordinate of a corner, from the residuals [px].
@@ -43,7 +42,6 @@ class RigFit:
     """
 
     parameters: Array
-    free: Mask
     covariance: Array
     residuals: Array
     corner_sigma_px: float
@@ -55,15 +53,15 @@ class RigFit:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
-def board_parameters_free(model: RigModel) -> Mask:
-    """Return the mask of unknown board parameters: all but those of exact places."""
-    free = model.given_sigma > 0.0
-    free[: model.shared] = False
-    return free
+def rms_px(residuals: Array) -> float:
+    """Return the root mean square length of residuals, shape (n, 2) [px]; NaN without any."""
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1)))) if len(residuals) else np.nan
 
 
-def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None = None) -> RigFit:
-    """Fit the free parameters to the views.
+def fit(
+    model: RigModel, start: Array, names: Collection[str], corner_sigma_px: float | None = None
+) -> RigFit:
+    """Fit some of the shared parameters, and all boards but those at exact places, to the views.
 
     Known places and windows are priors with their standard deviations.
 
@@ -73,8 +71,8 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
         Model with the views.
     start : ndarray, shape (p,)
         Initial parameters.
-    free : ndarray of bool, shape (p,)
-        Parameters to fit.
+    names : collection of str
+        Shared parameters to fit.
     corner_sigma_px : float, optional
         Standard deviation of the coordinate of a corner [px]; by default from the residuals.
 
@@ -83,6 +81,8 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
     RigFit
         The fit.
     """
+    free = model.given_sigma > 0.0
+    free[: model.shared] = [name in names for name in model.names]
     parameters, normal, cost = _minimize(model, start, free, corner_sigma_px or 0.3)
     residuals = model.residuals(parameters)
     sigma = corner_sigma_px
@@ -93,35 +93,7 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
         sigma = _spread(model, residuals, free)
     covariance = np.zeros((len(start), len(start)))
     covariance[np.ix_(free, free)] = _inverse_normal(normal)
-    return RigFit(parameters, free.copy(), covariance, residuals, sigma, cost)
-
-
-def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, float]]:
-    """Return the deviations of boards from places with a standard deviation.
-
-    Parameters
-    ----------
-    model : RigModel
-        Fitted model.
-    result : RigFit
-        Result of the fit.
-
-    Returns
-    -------
-    list of (str, float, float)
-        Name of the view; deviation of the centre of the board [m]; the largest deviation of its six
-        parameters in standard deviations.
-    """
-    poses = model.board_poses(result.parameters)
-    deviations = []
-    for number, view in enumerate(model.views):
-        if view.place is not None and 0.0 < view.place.sigma < np.inf:
-            own = slice(model.shared + 6 * number, model.shared + 6 * (number + 1))
-            pull = np.abs(result.parameters[own] / model.given_sigma[own]).max()
-            middle = np.append(view.left.points.mean(axis=0), 1.0)
-            away = np.linalg.norm((poses[number] - view.place.T_rig_board) @ middle)
-            deviations.append((view.name, float(away), float(pull)))
-    return deviations
+    return RigFit(parameters, covariance, residuals, sigma, cost)
 
 
 def misfit_px(model: RigModel, result: RigFit) -> float:
@@ -166,7 +138,7 @@ def _minimize(
     given = model.given_sigma[free] ** -2.0
 
     def cost_of(parameters: Array) -> tuple[float, Array]:
-        pixels = np.nan_to_num(model.residuals(parameters) / sigma, nan=1e4)
+        pixels = np.nan_to_num(model.residuals(parameters).ravel() / sigma, nan=1e4)
         robust = 2.0 * _OUTLIER**2 * (np.sqrt(1.0 + (pixels / _OUTLIER) ** 2) - 1.0)
         return float(0.5 * (robust.sum() + given @ parameters[free] ** 2)), pixels
 

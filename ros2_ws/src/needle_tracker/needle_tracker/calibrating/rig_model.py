@@ -21,6 +21,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -83,8 +84,6 @@ class RigModel:
         Initial cameras and windows.
     views : list of BoardView
         Views of the board.
-    boards : ndarray, shape (len(views), 4, 4)
-        Initial T_rig_board of each view.
     tied : bool
         Whether the relative pose of the cameras is fixed; rotation and translation of the right
         camera are then unused.
@@ -95,6 +94,12 @@ class RigModel:
         Names of the parameters that all views share, such as `left.fx`; they come first.
     shared : int
         Number of shared parameters.
+    pixels : ndarray, shape (n, 2)
+        Measured corners, those of the left camera first [px].
+    view_of : ndarray of int, shape (n,)
+        Number of the view of each corner.
+    seen_by : dict of str to ndarray of bool, shape (n,)
+        Corners of each camera.
     start : ndarray, shape (p,)
         Initial parameters.
     given_sigma : ndarray, shape (p,)
@@ -103,32 +108,26 @@ class RigModel:
     """
 
     def __init__(
-        self, start: StereoCalibration, views: list[BoardView], boards: Array, *, tied: bool = False
+        self, start: StereoCalibration, views: list[BoardView], *, tied: bool = False
     ) -> None:
-        self.views = views
-        self.tied = tied
-        self._start = start.cameras
-        self._windows = (start.left.window, start.right.window)
-        self._surface = start.surface
+        self.views, self.tied = views, tied
+        self._start, self._surface = start, start.surface
         cameras = tuple(f"{side}.{name}" for side in SIDES for name in LENS + POSE)
         own = tuple(f"{side}.{name}" for side in SIDES for name in WINDOW)
         windows = own if self._surface is None else SURFACE
         self.names = (*cameras, "square_size", *windows)
         self.shared = len(self.names)
-        self._boards = np.asarray(boards, dtype=np.float64).reshape(-1, 4, 4)
-        self._points = {s: np.concatenate([v.corners(s).points for v in views]) for s in SIDES}
-        self.pixels = {s: np.concatenate([v.corners(s).pixels for v in views]) for s in SIDES}
-        self.view_of = {
-            s: np.repeat(np.arange(len(views)), [len(v.corners(s).points) for v in views])
-            for s in SIDES
-        }
-        under = np.array([view.under_surface for view in views], dtype=bool)
-        self._under = {s: under[self.view_of[s]] for s in SIDES}
+        self._boards = initial_board_poses(start, views)
+        corners = [view.corners(side) for side in SIDES for view in views]
+        self._points = np.concatenate([one.points for one in corners])
+        self.pixels = np.concatenate([one.pixels for one in corners])
+        numbers = np.arange(len(corners)).repeat([len(one.points) for one in corners])
+        side_of, self.view_of = np.divmod(numbers, len(views))
+        self.seen_by = {side: side_of == number for number, side in enumerate(SIDES)}
+        self._under = np.array([view.place.under_surface for view in views])[self.view_of]
         self.start = np.zeros(self.shared + 6 * len(views))
-        for side in SIDES:
-            camera = self._start[side]
-            matrix = camera.camera_matrix
-            lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *camera.distortion]
+        for side, camera in start.cameras.items():
+            lens = [*camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion]
             self.start[camera_slice(side)][: len(LENS)] = lens
         if self._surface is not None:
             height = self._surface.point[0]
@@ -141,8 +140,22 @@ class RigModel:
 
     def calibration(self, parameters: Array) -> StereoCalibration:
         """Return the calibration of a parameter vector."""
-        left, right = (self._camera(parameters, side) for side in SIDES)
-        return StereoCalibration(left, right)
+        cameras: list[Camera] = []
+        for number, (side, start) in enumerate(self._start.cameras.items()):
+            fx, fy, cx, cy, *lens = parameters[camera_slice(side)][: len(LENS)]
+            matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+            if cameras and self.tied:
+                from_left = start.T_optical_rig @ np.linalg.inv(self._start.left.T_optical_rig)
+                transform = from_left @ cameras[0].T_optical_rig
+            else:
+                pose = parameters[camera_slice(side)][len(LENS) :]
+                step = pose_matrix(Rotation.from_rotvec(pose[:3]).as_matrix(), pose[3:])
+                transform = step @ start.T_optical_rig
+            window = self._window(parameters[FIRST_WINDOW : self.shared], start.window, number)
+            cameras.append(
+                Camera(start.width, start.height, matrix, np.array(lens), transform, window)
+            )
+        return StereoCalibration(*cameras)
 
     def board_poses(self, parameters: Array) -> Array:
         """Return T_rig_board of each view, shape (views, 4, 4)."""
@@ -153,23 +166,23 @@ class RigModel:
         return poses
 
     def residuals(self, parameters: Array) -> Array:
-        """Return measured minus expected pixels, left then right, shape (2 * corners,) [px]."""
-        sides = [(self.pixels[s] - self.project(parameters, s)).ravel() for s in SIDES]
-        return np.concatenate(sides)
+        """Return measured minus expected pixels of all corners, shape (n, 2) [px]."""
+        return self.pixels - self.project(parameters)
 
-    def project(self, parameters: Array, side: str) -> Array:
-        """Return the expected pixels of the corners of one camera, shape (n, 2) [px]."""
-        boards = self.board_poses(parameters)[self.view_of[side]]
-        corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side])
+    def project(self, parameters: Array) -> Array:
+        """Return the expected pixels of all corners, shape (n, 2) [px]."""
+        boards = self.board_poses(parameters)[self.view_of]
+        corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points)
         corners = (1.0 + parameters[SQUARES]) * corners + boards[:, :3, 3]
-        camera, under = self._camera(parameters, side), self._under[side]
         pixels = np.empty((len(corners), 2))
-        pixels[under] = RefractedCamera(camera).project(corners[under])
-        pixels[~under] = RefractedCamera(_in_air(camera)).project(corners[~under])
+        for side, camera in self.calibration(parameters).cameras.items():
+            for under, seen in ((True, camera), (False, _in_air(camera))):
+                chosen = self.seen_by[side] & (self._under == under)
+                pixels[chosen] = RefractedCamera(seen).project(corners[chosen])
         return pixels
 
     def jacobian(self, parameters: Array, free: Mask) -> Array:
-        """Return d(residuals)/d(free parameters), shape (2 * corners, free).
+        """Return d(residuals)/d(free parameters), shape (2 * n, free).
 
         Parameters
         ----------
@@ -178,53 +191,36 @@ class RigModel:
         free : ndarray of bool, shape (p,)
             Parameters to vary.
         """
-        count = {side: 2 * len(self.pixels[side]) for side in SIDES}
-        result = np.zeros((sum(count.values()), len(parameters)))
-        for side in SIDES:
-            first = 0 if side == "left" else count["left"]
-            rows = slice(first, first + count[side])
-            cameras = range(0 if self.tied else camera_slice(side).start, camera_slice(side).stop)
-            for column in [*cameras, *range(SQUARES, self.shared)]:
-                if free[column]:
-                    slopes = self._slopes(parameters, side, np.array([column]))
-                    result[rows, column] = -slopes.ravel()
-            # The pose of a board affects only its own corners: vary all boards at once.
-            of_boards = np.arange(self.shared, len(parameters)).reshape(-1, 6)
-            lines = first + np.arange(count[side]).reshape(-1, 2)
-            for columns in of_boards[:, : 6 * bool(np.any(free[self.shared :]))].T:
-                slopes = self._slopes(parameters, side, columns)
-                result[lines, columns[self.view_of[side]][:, None]] = -slopes
-        return result[:, free]
+        corners = np.arange(len(self.pixels))
+        result = np.zeros((len(corners), 2, len(parameters)))
+        for columns in self._columns():
+            if np.any(free[columns]):
+                step = np.zeros_like(parameters)
+                step[columns] = self._steps[columns]
+                above, below = (self.project(parameters + s * step) for s in (1.0, -1.0))
+                slopes = (below - above) / (2.0 * self._steps[columns][:, None])
+                result[corners, :, columns] = slopes
+        return result.reshape(-1, len(parameters))[:, free]
 
-    def _slopes(self, parameters: Array, side: str, columns: NDArray[np.intp]) -> Array:
-        """Return d(pixel)/d(parameters) for parameters that vary together, shape (n, 2)."""
-        step = np.zeros_like(parameters)
-        step[columns] = self._steps[columns]
-        above, below = (self.project(parameters + s * step, side) for s in (1.0, -1.0))
-        return np.asarray((above - below) / (2.0 * self._steps[columns[0]]))
+    def _columns(self) -> list[NDArray[np.intp]]:
+        """Return groups of parameters that can vary at once: for each corner its own, shape (n,).
 
-    def _transform(self, parameters: Array, side: str) -> Array:
-        """Return T_optical_rig: rotated about the centre of the camera, then translated."""
-        start = self._start[side].T_optical_rig
-        if self.tied and side == "right":
-            left = self._start["left"].T_optical_rig
-            return np.asarray(start @ np.linalg.inv(left) @ self._transform(parameters, "left"))
-        pose = parameters[camera_slice(side)][len(LENS) :]
-        step = pose_matrix(Rotation.from_rotvec(pose[:3]).as_matrix(), pose[3:])
-        return np.asarray(step @ start)
+        Camera, window and board of one corner do not affect those of another.
+        """
+        side, both = self.seen_by["right"].astype(int), np.zeros_like(self.view_of)
+        window, count = (side, len(WINDOW)) if self._surface is None else (both, len(SURFACE))
+        firsts = (
+            (_CAMERA * side, len(LENS)),
+            (_CAMERA * (both if self.tied else side) + len(LENS), len(POSE)),
+            (both + SQUARES, 1),
+            (count * window + FIRST_WINDOW, count),
+            (6 * self.view_of + self.shared, 6),
+        )
+        return [first + number for first, count in firsts for number in range(count)]
 
-    def _camera(self, parameters: Array, side: str) -> Camera:
-        start, own = self._start[side], parameters[camera_slice(side)]
-        fx, fy, cx, cy = own[:4]
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        transform = self._transform(parameters, side)
-        window = self._window(parameters[FIRST_WINDOW : self.shared], SIDES.index(side))
-        return Camera(start.width, start.height, matrix, own[4:9].copy(), transform, window)
-
-    def _window(self, parameters: Array, number: int) -> Window:
+    def _window(self, parameters: Array, window: Window, number: int) -> Window:
         if self._surface is not None:
             return surface_from_above(float(parameters[1]), float(parameters[0]))
-        window = self._windows[number]
         offset, *tilt = parameters.reshape(len(SIDES), -1)[number]
         # Any two axes perpendicular to the normal.
         axes = np.linalg.svd(window.normal[None])[2][1:]
@@ -232,6 +228,40 @@ class RigModel:
         return dataclasses.replace(
             window, point=window.point + offset * window.normal, normal=turned
         )
+
+
+def initial_board_poses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
+    """Return T_rig_board of each view, shape (n, 4, 4): as given, else from one camera.
+
+    Parameters
+    ----------
+    calibration : StereoCalibration
+        Cameras; the windows are ignored.
+    views : list of BoardView
+        Views, each with the corners of at least one camera.
+    """
+    boards = []
+    for view in views:
+        if view.place.is_known:
+            boards.append(view.place.T_rig_board)
+            continue
+        side = next(side for side in SIDES if len(view.corners(side).points))
+        camera = calibration.cameras[side]
+        boards.append(np.linalg.inv(camera.T_optical_rig) @ board_pose(camera, view.corners(side)))
+    return np.stack(boards)
+
+
+def board_pose(camera: Camera, corners: Corners) -> Array:
+    """Return the pose of the board in the optical frame, shape (4, 4), without refraction."""
+    _, rotation, translation = cv2.solvePnP(
+        corners.points,
+        corners.pixels,
+        camera.camera_matrix,
+        camera.distortion,
+        flags=cv2.SOLVEPNP_IPPE,
+    )
+    turn = np.asarray(cv2.Rodrigues(np.asarray(rotation).reshape(3))[0], dtype=np.float64)
+    return pose_matrix(turn, np.asarray(translation).reshape(3))
 
 
 def _in_air(camera: Camera) -> Camera:
@@ -243,7 +273,7 @@ def _in_air(camera: Camera) -> Camera:
 
 def _place_sigma(view: BoardView) -> Array:
     """Return the standard deviations of the place of a board, shape (6,) [rad, m]."""
-    if view.place is None or not view.place.is_known:
+    if not view.place.is_known:
         return np.full(6, np.inf)
     # The sigma of the rotation follows from that of the board's edges.
     reach = max(float(np.ptp(view.left.points[:, :2], axis=0).max()), 1e-3)
@@ -269,26 +299,18 @@ def needle_points(calibration: StereoCalibration) -> Array:
         np.linspace(*INSERTIONS, 5),
     )
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    for camera in (calibration.left, calibration.right):
+    for camera in calibration.cameras.values():
         points = points[camera.window.depth(points) >= LEAST_DEPTH]
     if not len(points):
         raise UserError("the needle's axis, z of rig, is not in the phantom behind both windows")
     return points
 
 
-def tip_shifts(assumed: StereoCalibration, true: StereoCalibration) -> Array:
-    """Return the errors of tips, shape (n, 3), in `rig` [m].
-
-    Parameters
-    ----------
-    assumed : StereoCalibration
-        Calibration of the triangulation.
-    true : StereoCalibration
-        True calibration.
-    """
+def tip_shift_p95(assumed: StereoCalibration, true: StereoCalibration) -> float:
+    """Return the 95 % error of tips that are triangulated with an assumed calibration [m]."""
     points = needle_points(true)
-    left, right = (view.project(points) for view in stereo_views(true))
-    return tip_errors(assumed, points, left, right)
+    shifts = tip_errors(assumed, points, *(view.project(points) for view in stereo_views(true)))
+    return float(np.percentile(np.linalg.norm(shifts, axis=-1), 95.0))
 
 
 def tip_errors(assumed: StereoCalibration, points: Array, left: Array, right: Array) -> Array:
@@ -321,16 +343,17 @@ def tip_error_p95(
     ----------
     calibration : StereoCalibration
         The calibration.
-    covariance : ndarray, shape (s, s)
-        Covariance of the parameters that all views share (`RigModel.names`).
+    covariance : ndarray, shape (p, p)
+        Covariance of the parameters; only those count that all views share (`RigModel.names`).
     tied : bool
         Whether the relative pose of the cameras is fixed.
     """
-    generator = np.random.default_rng(_SEED)
-    values, vectors = np.linalg.eigh(covariance)
+    generator, slopes = np.random.default_rng(_SEED), _tip_slopes(calibration, tied=tied)
+    shared = slopes.shape[-1]
+    values, vectors = np.linalg.eigh(covariance[:shared, :shared])
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    draws = generator.standard_normal((_DRAWS, len(covariance))) @ root.T
-    shifts = np.einsum("nij,dj->dni", _tip_slopes(calibration, tied=tied), draws)
+    draws = generator.standard_normal((_DRAWS, shared)) @ root.T
+    shifts = np.einsum("nij,dj->dni", slopes, draws)
     return float(np.percentile(np.linalg.norm(shifts, axis=-1), 95.0))
 
 
@@ -342,7 +365,7 @@ def _tip_slopes(calibration: StereoCalibration, *, tied: bool) -> Array:
     points = needle_points(calibration)
     nowhere = Corners(points, np.zeros((len(points), 2)))
     view = BoardView("", Place(np.eye(4), under_surface=True), nowhere, nowhere)
-    model = RigModel(calibration, [view], np.eye(4)[None], tied=tied)
+    model = RigModel(calibration, [view], tied=tied)
     free = np.zeros(len(model.start), dtype=bool)
     free[: model.shared] = True
     # Residuals are measured minus expected: the sign changes twice.

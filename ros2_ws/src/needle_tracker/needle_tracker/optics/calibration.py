@@ -13,6 +13,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
+from needle_core.files.installed import find_shared_file
 from needle_core.files.yaml_files import load_yaml, read_calibration
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 
@@ -155,10 +156,11 @@ class Camera:
 
 @dataclasses.dataclass(frozen=True)
 class StereoCalibration:
-    """Both cameras, each with its window."""
+    """Both cameras, each with its window; `text` is that of its file, if it has one."""
 
     left: Camera
     right: Camera
+    text: str = dataclasses.field(default="", kw_only=True)
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -176,14 +178,14 @@ class StereoCalibration:
         return common_surface(self.left.window, self.right.window)
 
 
-def load_calibration(path: Path) -> StereoCalibration:
+def load_calibration(file: str | Path) -> StereoCalibration:
     """Read and check a calibration file.
 
     Parameters
     ----------
-    path : Path
+    file : str or Path
         YAML file in the format of docs/calibration.md: `left` and `right`; `phantom`, or a `window`
-        under each of them.
+        under each of them. An empty text stands for the simulated bench's.
 
     Returns
     -------
@@ -195,13 +197,14 @@ def load_calibration(path: Path) -> StereoCalibration:
     UserError
         Unreadable, not YAML, or a value missing, not finite, of the wrong size or out of bounds.
     """
+    path = Path(file or find_shared_file("needle_tracker", "config/calibration.yaml")).expanduser()
     return calibration_from(read_calibration(path), path)
 
 
 def calibration_from(text: str, path: Path) -> StereoCalibration:
     """Return the calibration in the text of a file; raises as `load_calibration`."""
     try:
-        return parse_calibration(load_yaml(text))
+        return dataclasses.replace(parse_calibration(load_yaml(text)), text=text)
     except (UserError, ValueError) as error:
         raise UserError(f"calibration {path}: {error}") from error
 
@@ -218,13 +221,6 @@ def parse_calibration(content: Any) -> StereoCalibration:
         _camera(content, side, window)
         for side, window in zip(SIDES, parse_windows(content), strict=True)
     )
-    for side, camera in zip(SIDES, (left, right), strict=True):
-        height = float(camera.window.height(camera.centre))
-        if height <= 0.0:
-            raise UserError(
-                f"{side} camera is not above the surface that it looks through, but "
-                f"{-1e3 * height:.1f} mm beneath: the window's normal must point to the camera"
-            )
     if np.linalg.norm(left.centre - right.centre) < LEAST_BASELINE:
         raise UserError("left and right camera are in the same place: no depth can be measured")
     return StereoCalibration(left, right)
@@ -302,7 +298,14 @@ def _camera(content: Any, side: str, window: Window) -> Camera:
         raise UserError(f"{side}.distortion_model = {model!r}, expected {_DISTORTION_MODEL!r}")
     distortion = numbers(content, 5, side, "distortion_coefficients", "data")
     transform = transform_of(content, side, "T_optical_rig")
-    return Camera(width, height, matrix, distortion, transform, window)
+    camera = Camera(width, height, matrix, distortion, transform, window)
+    above = float(window.height(camera.centre))
+    if above <= 0.0:
+        raise UserError(
+            f"{side} camera is not above the surface that it looks through, but "
+            f"{-1e3 * above:.1f} mm beneath: the window's normal must point to the camera"
+        )
+    return camera
 
 
 def transform_of(content: Any, *keys: str) -> NDArray[np.float64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -11,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Image
@@ -23,11 +20,12 @@ from needle_core.errors import UserError
 from needle_core.message_types import to_nanoseconds
 from needle_core.process.discovery import restrict_discovery
 from needle_core.process.shared_memory import remove_incomplete_ports
-from needle_core.ros.base_node import IMAGES_BEST_EFFORT, WholeNode
+from needle_core.ros.base_node import IMAGES_BEST_EFFORT, WholeNode, spin_until
 from needle_core.settings.bounds import check_bounds
 from needle_tracker.answers.tracker_messages import frame_of
 from needle_tracker.calibrating.calibration_check import check, figures, report
 from needle_tracker.calibrating.calibration_session import (
+    HELD_FREELY,
     BoardView,
     Session,
     averaged_view,
@@ -65,26 +63,17 @@ _LIVE_PAIRS, _TIMEOUT = 10, 10.0  # pairs that are averaged, and the wait for th
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     words = list(sys.argv if arguments is None else ["check_calibration", *arguments])
-    return run_command(lambda: check_calibration(parse(remove_ros_args(words)[1:]), words))
+    return run_command(lambda: check_calibration(parse(remove_ros_args(words)[1:])))
 
 
 def parse(arguments: Sequence[str]) -> Namespace:
-    """Return the options of a command line, without the name of the program; `limit` is in metres.
+    """Return the options of a command line, without the name of the program.
 
     Raises
     ------
     UserError
         Contradictory options, or a number out of bounds.
     """
-    given = _parser().parse_args(arguments)
-    if len({given.left is None, given.right is None, given.live is not None}) > 1:
-        raise UserError("give either --left and --right, or --live; see --help")
-    check_bounds("--limit-mm", given.limit_mm, 0.001, 10.0, "mm")
-    given.limit = 1e-3 * given.limit_mm
-    return given
-
-
-def _parser() -> CommandParser:
     parser = CommandParser("check_calibration", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
     add("--calibration", type=Path, required=True, metavar="FILE", help="calibration to check")
@@ -94,10 +83,14 @@ def _parser() -> CommandParser:
     add("--live", metavar="NAME", help="use images from topics, the board at this place")
     add("--limit-mm", type=float, default=0.15, metavar="MM", help="accepted tip error (0.15)")
     add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")
-    return parser
+    given = parser.parse_args(arguments)
+    if len({given.left is None, given.right is None, given.live is not None}) > 1:
+        raise UserError("give either --left and --right, or --live; see --help")
+    check_bounds("--limit-mm", given.limit_mm, 0.001, 10.0, "mm")
+    return given
 
 
-def check_calibration(options: Namespace, words: list[str]) -> int:
+def check_calibration(options: Namespace) -> int:
     """Check the calibration, print and write the result."""
     calibration, session = load_calibration(options.calibration), load_session(options.session)
     if options.left is not None and options.right is not None:
@@ -105,69 +98,52 @@ def check_calibration(options: Namespace, words: list[str]) -> int:
         for side, expected in calibration.sizes.items():
             if problem := size_problem(side, sizes[side], expected):
                 raise UserError(problem)
-        if free := [view.name for view in views if view.place is None]:
+        if free := [view.name for view in views if view.kind == "free"]:
             print(f"held freely in air, as the session has no such place: {', '.join(free)}")
     else:
-        views = [_live_view(options, calibration, session, words)]
-    result = check(calibration, views, options.limit)
+        views = [_live_view(str(options.live), calibration, session)]
+    result = check(calibration, views, 1e-3 * options.limit_mm)
     print(report(result))
-    if options.json is not None:
-        write_json(options.json, figures(result))
+    write_json(options.json, figures(result))
     return EXIT_DONE if result.ok else EXIT_MISSED
 
 
-def _live_view(
-    options: Namespace, calibration: StereoCalibration, session: Session, words: list[str]
-) -> BoardView:
-    name = str(options.live)
-    if session.place_of(name) is None:
+def _live_view(name: str, calibration: StereoCalibration, session: Session) -> BoardView:
+    if session.place_of(name) is HELD_FREELY:
         raise UserError(f"--live {name} is none of the session's places")
-    context = Context()
     restrict_discovery()
     remove_incomplete_ports()
-    rclpy.init(args=words, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        pairs = _live_pairs(context, calibration)
+        return averaged_view(name, session, _live_pairs(calibration))
     finally:
-        rclpy.try_shutdown(context=context)
-    return averaged_view(name, session, pairs)
+        rclpy.try_shutdown()
 
 
-def _live_pairs(context: Context, calibration: StereoCalibration) -> list[dict[str, np.ndarray]]:
+def _live_pairs(calibration: StereoCalibration) -> list[tuple[np.ndarray, np.ndarray]]:
     """Receive image pairs; raise a `UserError` for images of other cameras, or too few."""
-    node = WholeNode("check_calibration", context=context)
+    node = WholeNode("check_calibration")
     # The board is at rest: images of cameras without a trigger may be half a frame apart.
     matcher: PairMatcher[np.ndarray] = PairMatcher(None)
-    pairs: list[dict[str, np.ndarray]] = []
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
 
     def receive(side: str, message: Image) -> None:
         frame = frame_of(message, side, calibration.cameras[side])
         if frame.pixels is None:
             raise UserError(frame.problem)
         stamp_ns = to_nanoseconds(message.header.stamp)
-        pair = matcher.add(side, stamp_ns, frame.pixels.copy())
-        if pair is not None:
-            pairs.append({"left": pair.left, "right": pair.right})
+        if pair := matcher.add(side, stamp_ns, frame.pixels.copy()):
+            pairs.append((pair.left, pair.right))
 
     for side in SIDES:
         on_image = partial(receive, side)
         node.create_subscription(Image, f"stereo/{side}/image_raw", on_image, IMAGES_BEST_EFFORT)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    end = time.monotonic() + _TIMEOUT
-    try:
-        while len(pairs) < _LIVE_PAIRS:
-            left = end - time.monotonic()
-            if left <= 0.0:
-                raise UserError(
-                    f"{len(pairs)} image pairs of {_LIVE_PAIRS} in {_TIMEOUT:g} s on "
-                    f"stereo/{{left,right}}/image_raw (without a partner: "
-                    f"{matcher.unpaired.total()})"
-                )
-            executor.spin_once(timeout_sec=left)
-    finally:
-        executor.shutdown()
-        node.destroy_node()
+    spin_until(node, lambda: len(pairs) >= _LIVE_PAIRS, _TIMEOUT)
+    if len(pairs) < _LIVE_PAIRS:
+        raise UserError(
+            f"{len(pairs)} image pairs of {_LIVE_PAIRS} in {_TIMEOUT:g} s on "
+            f"stereo/{{left,right}}/image_raw (without a partner: {matcher.unpaired.total()})"
+        )
     return pairs
 
 

@@ -6,8 +6,9 @@ import dataclasses
 import itertools
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,6 +29,7 @@ _CAMERA_NUMBER = "(?:(?<=cam)|(?<=cam[-_])|(?<=camera)|(?<=camera[-_]))%d(?!\\d)
 _WORDS = (("left", "right"), (_CAMERA_NUMBER % 0, "1"), (_CAMERA_NUMBER % 1, "2"), ("l", "r"))
 _SEPARATORS = "-_. "
 _SIDES = ("left", "right")
+_LISTED = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,8 +94,6 @@ class PairSequence:
         Names of the pairs, in natural order; for videos as many as the containers declare.
     unpaired : list of str
         Names without a partner, with their side; for videos, complete only at the end.
-    cut_off : int
-        Number of pairs that the containers declare but the data lack; valid only at the end.
     """
 
     names: list[str]
@@ -101,22 +101,22 @@ class PairSequence:
     _left: Path
     _right: Path
     _files: list[tuple[str, str]] | None
-    cut_off: int = 0
+    _cut_off: int = 0  # pairs that the containers declare but the data lack
 
     def refuse_unpaired(self) -> PairSequence:
         """Return the sequence itself; raises a `UserError` if an image has no partner."""
         if self.unpaired:
-            raise UserError(f"images without a partner ({len(self.unpaired)}): {self.unpaired[0]}")
+            raise UserError(self.missing)
         return self
 
     @property
     def missing(self) -> str:
-        """Missing frames of the videos, as text, valid only at the end; empty if complete."""
+        """Missing images as text; for videos, complete only at the end; empty if complete."""
         parts = []
         if self.unpaired:
-            parts.append(f"{len(self.unpaired)} frames without a partner")
-        if self.cut_off:
-            parts.append(f"{self.cut_off} of {len(self.names)} pairs cannot be read: cut off?")
+            parts.append(f"{len(self.unpaired)} images without a partner: {listed(self.unpaired)}")
+        if self._cut_off:
+            parts.append(f"{self._cut_off} of {len(self.names)} pairs cannot be read: cut off?")
         return ", ".join(parts)
 
     def __iter__(self) -> Iterator[NamedPair]:
@@ -132,7 +132,7 @@ class PairSequence:
         videos = [cv2.VideoCapture(str(path)) for path in (self._left, self._right)]
         self.unpaired.clear()
         for index in itertools.count():
-            left, right = frames = [_next_frame(video) for video in videos]
+            left, right = frames = [grey_frame(*video.read()) for video in videos]
             if left is None or right is None:
                 break
             name = f"{index:06d}"
@@ -141,8 +141,8 @@ class PairSequence:
             unpaired, frame = index, more
             while frame is not None:
                 self.unpaired.append(f"{side} {unpaired:06d}")
-                unpaired, frame = unpaired + 1, _next_frame(video)
-        self.cut_off = max(len(self.names) - index, 0)
+                unpaired, frame = unpaired + 1, grey_frame(*video.read())
+        self._cut_off = max(len(self.names) - index, 0)
 
 
 def open_pairs(left: Path, right: Path) -> PairSequence:
@@ -170,13 +170,11 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
     if left.is_dir() != right.is_dir():
         raise UserError(f"--left {left} and --right {right}: one is a folder, the other is not")
     if not left.is_dir():
-        counts = [
-            _frame_count(side, path) for side, path in zip(_SIDES, (left, right), strict=True)
-        ]
-        names = [f"{index:06d}" for index in range(max(min(counts), 0))]
+        count = min(_frame_count(side, path) for side, path in paths.items())
+        names = [f"{index:06d}" for index in range(count)]
         return PairSequence(names, [], left, right, None)
     one_folder = left.samefile(right)
-    found = [_images_in(side, path) for side, path in zip(_SIDES, (left, right), strict=True)]
+    found = [_images_in(side, path) for side, path in paths.items()]
     pairs = sorted(_pair(*found, one_folder=one_folder), key=lambda pair: _natural(pair[0]))
     if not pairs:
         samples = [f"{len(names)}, such as {min(names, key=_natural)}" for names in found]
@@ -187,15 +185,20 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
             "and cam1"
         )
     files = [(left_name, right_name) for _, left_name, right_name in pairs]
-    used = [set(names) for names in zip(*files, strict=True)]
-    if one_folder:
-        used, found = [used[0] | used[1], set()], [found[0], set()]
+    # Files of the same name in two folders are a pair: a name is used in both or in neither.
+    used = {name for names in files for name in names}
     unpaired = [
         f"{side} {name}"
-        for side, names, taken in zip(_SIDES, found, used, strict=True)
-        for name in sorted(names - taken, key=_natural)
+        for side, names in zip(_SIDES, found[:1] if one_folder else found, strict=False)
+        for name in sorted(names - used, key=_natural)
     ]
     return PairSequence([name for name, *_ in pairs], unpaired, left, right, files)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return some names as text; of many, only the number of the others."""
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more
 
 
 def progress(pairs: PairSequence, what: str) -> Iterator[NamedPair]:
@@ -279,7 +282,7 @@ def _read(path: Path) -> Image | None:
     """Return the grey image of a file; None unless it has 8 bits."""
     # Without ANYDEPTH OpenCV would silently convert 16 bits to 8.
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    return _grey(cv2.imread(str(path), flags))
+    return grey_frame(True, cv2.imread(str(path), flags))
 
 
 def _frame_count(side: str, path: Path) -> int:
@@ -289,14 +292,9 @@ def _frame_count(side: str, path: Path) -> int:
     return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
 
 
-def _next_frame(video: cv2.VideoCapture) -> Image | None:
-    good, frame = video.read()
-    if not good or frame is None:
+def grey_frame(is_read: bool, frame: NDArray[Any] | None) -> Image | None:
+    """Return the grey image of a result of OpenCV; None if it is missing or not of 8 bits."""
+    if not is_read or frame is None or frame.dtype != np.uint8:
         return None
-    return _grey(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
-
-
-def _grey(image: NDArray[np.uint8] | None) -> Image | None:
-    if image is None or image.dtype != np.uint8:
-        return None
-    return image if image.ndim == 2 else image.reshape(image.shape[:2])
+    is_grey = frame.shape[2:] in ((), (1,))
+    return frame.reshape(frame.shape[:2]) if is_grey else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)

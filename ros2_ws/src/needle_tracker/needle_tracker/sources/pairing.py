@@ -160,16 +160,12 @@ class InsertionHistory:
 
     @property
     def latest(self) -> int:
-        """Stamp of the last sample [ns]; 0 without any."""
-        return self._samples[-1][0] if self._samples else 0
+        """Stamp of the last sample, up to which `at` is final [ns]; -1 without any."""
+        return self._samples[-1][0] if self._samples else -1
 
     def time_before(self, stamp: int) -> int:
         """Return the time from `stamp` to the first sample ever [ns]; 0 if that was before."""
         return max(0, self._first - stamp) if self._samples else 0
-
-    def is_bracketed(self, stamp: int) -> bool:
-        """Return whether there is a sample at or after `stamp` [ns], so that `at` is final."""
-        return bool(self._samples) and self._samples[-1][0] >= stamp
 
     def at(self, stamp: int) -> float | None:
         """Return the interpolated insertion [m] at `stamp` [ns]; None outside the samples."""

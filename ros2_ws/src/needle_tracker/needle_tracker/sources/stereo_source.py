@@ -6,10 +6,9 @@ import dataclasses
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import cv2
-import numpy as np
 
 from needle_core.component import Batch, PortChange
 from needle_core.errors import UserError
@@ -17,6 +16,7 @@ from needle_tracker.sources.image_files import (
     Image,
     PairSequence,
     Sizes,
+    grey_frame,
     open_pairs,
     size_problem,
 )
@@ -98,11 +98,14 @@ def open_source(
 
 def open_cameras(names: tuple[str, str], sizes: Sizes, rate: float) -> list[cv2.VideoCapture]:
     """Return the left and the right camera, opened by OpenCV; see `open_source`."""
+    # Failures are reported in one line; silence the messages of OpenCV, of which 5 moved this.
+    logging = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
+    logging.setLogLevel(0)
     captures: list[cv2.VideoCapture] = []
     for (side, (width, height)), name in zip(sizes.items(), names, strict=True):
         if name.startswith("/dev/") and not Path(name).exists():
             raise UserError(f"{side} camera {name} does not exist")
-        capture = _open_device(name)
+        capture = cv2.VideoCapture(int(name) if name.isdecimal() else name, cv2.CAP_V4L2)
         captures.append(capture)
         if not capture.isOpened():
             for opened in captures:
@@ -136,7 +139,7 @@ def camera_pairs(
         while failed < LOST_AFTER:
             grabs = [(capture.grab(), clock()) for capture in captures]
             is_whole = all(is_grabbed for is_grabbed, _ in grabs)
-            left, right = (_retrieve(capture) if is_whole else None for capture in captures)
+            left, right = (grey_frame(*c.retrieve()) if is_whole else None for c in captures)
             if left is None or right is None:
                 failed += 1
                 if failed < LOST_AFTER:
@@ -151,14 +154,6 @@ def camera_pairs(
     finally:
         for capture in captures:
             capture.release()
-
-
-def _retrieve(capture: cv2.VideoCapture) -> Image | None:
-    good, frame = capture.retrieve()
-    if not good or frame is None:
-        return None
-    grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    return np.ascontiguousarray(grey, dtype=np.uint8)
 
 
 def recorded_pairs(
@@ -189,17 +184,6 @@ def recorded_pairs(
             yield StampedPair(pair.left, pair.right, stamp, stamp)
     while True:
         yield EndOfRecording(pairs.missing)
-
-
-def _open_device(name: str) -> cv2.VideoCapture:
-    # Failures are reported in one line; silence the messages of OpenCV.
-    opencv = cast(Any, cv2)
-    # OpenCV 5 moved the function.
-    logging = opencv if hasattr(opencv, "setLogLevel") else opencv.utils.logging
-    logging.setLogLevel(0)
-    if name.isdecimal():
-        return cv2.VideoCapture(int(name), cv2.CAP_V4L2)
-    return cv2.VideoCapture(name, cv2.CAP_V4L2)
 
 
 class PairPort:

@@ -212,7 +212,7 @@ def _main() -> int:
     parser.add_argument("points", metavar="POINTS.csv", type=Path, help="paired points")
     parser.add_argument("--pivot", metavar="FILE.csv", type=Path, help="poses about the tip")
     parser.add_argument("--output", metavar="FILE.yaml", required=True, help="registration file")
-    parser.add_argument("--json", metavar="FILE", help="write the results as JSON; - for stdout")
+    parser.add_argument("--json", metavar="FILE", help="also write the results as flat JSON")
     options = parser.parse_args()
     names, numbers = _read(options.points, _POINT_COLUMNS)
     found, fitted, left_out = register(names, 1e-3 * numbers[:, :3], 1e-3 * numbers[:, 3:])
@@ -233,8 +233,7 @@ def _main() -> int:
     output = output_file("--output", options.output)
     write_registration(output, found, lines)
     print("\n".join(lines))
-    if options.json:
-        write_json(output_file("--json", options.json), results)
+    write_json(output_file("--json", options.json), results)
     return EXIT_DONE
 
 

@@ -6,13 +6,11 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from needle_core.errors import UserError
-from needle_core.files.file_access import write_text
-from needle_core.files.yaml_files import read_yaml
+from needle_core.files.yaml_files import read_yaml, write_yaml
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.optics.calibration import number, numbers, transform_of
 
@@ -118,5 +116,4 @@ def write_registration(path: Path, found: Registration, comments: list[str]) -> 
         "tip_offset": found.tip_offset.tolist(),
         "sensor_std": found.sensor_std,
     }
-    text = yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=100)
-    write_text(path, "".join(f"# {line}\n" for line in comments) + text)
+    write_yaml(path, content, comments)

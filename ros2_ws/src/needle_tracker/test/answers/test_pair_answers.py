@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from needle_tracker.answers import pair_answers
-from needle_tracker.answers.pair_answers import Answer, Frame, PairAnswers, SwapWatch
+from needle_tracker.answers.pair_answers import Answer, PairAnswers, SwapWatch
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.sources.image_encodings import Frame
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 FRAME = Frame(np.zeros((768, 1024), np.uint8))

@@ -11,6 +11,7 @@ import pytest
 
 from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import (
+    HELD_FREELY,
     Place,
     Session,
     averaged_view,
@@ -39,7 +40,7 @@ def test_each_pair_of_images_is_a_view(folder: Path) -> None:
     assert sizes == dict.fromkeys(SIDES, IMAGE.shape[::-1])
     assert [view.name for view in views] == ["free_1", "top"]
     free, top = views
-    assert (free.place, top.place) == (None, SESSION.places["top"])
+    assert (free.place, top.place) == (HELD_FREELY, SESSION.places["top"])
     assert len(free.right.points) == 0
     for corners in (top.left, top.right, free.left):
         np.testing.assert_allclose(corners.points, SMALL.corners)
@@ -74,7 +75,7 @@ def another_board(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "cause"),
     [
-        (drop("left/free_1.png"), r"without a partner \(1\): right free_1.png"),
+        (drop("left/free_1.png"), "1 images without a partner: right free_1.png"),
         (write("right/top.png", np.zeros((48, 64), np.uint8)), "top.png is 64x48"),
         (broken, "cannot read .*top.png"),
         (no_image_of_the_place, "places.top has no image"),
@@ -93,7 +94,7 @@ def test_a_board_at_rest_is_averaged_over_its_exposures() -> None:
     rng = np.random.default_rng(0)
     noise = rng.normal(0.0, 10.0, (10, *IMAGE.shape))
     exposures = np.clip(0.6 * IMAGE + 50.0 + noise, 0.0, 255.0).astype(np.uint8)
-    view = averaged_view("top", SESSION, [dict.fromkeys(SIDES, image) for image in exposures])
+    view = averaged_view("top", SESSION, [(image, image) for image in exposures])
     assert view.place is SESSION.places["top"]
     _, true = SMALL.find(IMAGE)
     one = SMALL.find(exposures[0])[1]
@@ -102,4 +103,4 @@ def test_a_board_at_rest_is_averaged_over_its_exposures() -> None:
         assert np.std(corners.pixels - true) < 0.5 * np.std(one - true)
     blank = np.full_like(IMAGE, 90)
     with pytest.raises(UserError, match="no image shows the session's board"):
-        averaged_view("top", SESSION, [dict.fromkeys(SIDES, blank)])
+        averaged_view("top", SESSION, [(blank, blank)])

@@ -11,7 +11,7 @@ import pytest
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_tracker.calibrating.calibration_check import check, figures, report
-from needle_tracker.calibrating.calibration_session import BoardView, Place
+from needle_tracker.calibrating.calibration_session import HELD_FREELY, BoardView, Place
 from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 from synthetic_rig import (
@@ -95,7 +95,7 @@ def test_a_target_that_cannot_detect_errors_is_never_ok(
     calibration: StereoCalibration, rig: StereoRig
 ) -> None:
     rng = np.random.default_rng(1)
-    free = view_of(rig, "free", free_pose(rng), None, rng)
+    free = view_of(rig, "free", free_pose(rng), HELD_FREELY, rng)
     for views in (target(rig, ("surface",)), [free]):
         found = check(calibration, views, LIMIT)
         assert not found.ok

@@ -11,7 +11,12 @@ import pytest
 import yaml
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.calibration_session import Place, load_session, parse_session
+from needle_tracker.calibrating.calibration_session import (
+    HELD_FREELY,
+    Place,
+    load_session,
+    parse_session,
+)
 from needle_tracker.optics.calibration import SIDES
 from synthetic_rig import BOARD, GIVEN_BOX, PLACES, STANDS, flat_pose, session_content
 
@@ -43,10 +48,9 @@ def test_a_session_is_read(tmp_path: Path) -> None:
     assert [w.inside for w in read.windows] == [1.33, 1.33]
     for name, place in PLACES.items():
         found = read.place_of(name)
-        assert found is not None
         np.testing.assert_allclose(found.T_rig_board, place.T_rig_board, atol=1e-12)
         assert (found.under_surface, found.sigma) == (place.under_surface, place.sigma)
-    assert read.place_of("free_1") is None
+    assert read.place_of("free_1") is HELD_FREELY
 
 
 def test_a_session_has_windows_and_boards_in_the_box() -> None:
@@ -56,8 +60,6 @@ def test_a_session_has_windows_and_boards_in_the_box() -> None:
         assert window.normal.tolist() == given.normal.tolist()
         assert (window.layers, window.inside) == (given.layers, given.inside)
     held, stands = session.place_of("box_07"), session.place_of("stand")
-    assert held is not None
-    assert stands is not None
     assert (held.under_surface, held.is_known) == (True, False)
     assert (stands.under_surface, stands.is_known, stands.sigma) == (True, True, 0.0)
 
@@ -68,7 +70,7 @@ def test_places_are_found_by_name_or_pattern_and_lie_flat_by_default() -> None:
     assert place is session.places["on_17.5"]
     np.testing.assert_allclose(place.T_rig_board, flat_pose([0.018, -0.04, 0.01]), atol=1e-12)
     assert session.place_of("on_18.25") is session.places["on_18.*"]
-    assert session.place_of("on_17") is None
+    assert session.place_of("on_17") is HELD_FREELY
 
 
 def test_a_wrong_place_is_named() -> None:

@@ -11,9 +11,10 @@ from needle_sim.camera.stereo_rig import StereoRig
 from needle_tracker.calibrating.calibrate_stereo import report
 from needle_tracker.calibrating.calibration_outliers import (
     contradictions,
+    misfits,
     ring_patterns,
 )
-from needle_tracker.calibrating.calibration_session import BoardView, Corners
+from needle_tracker.calibrating.calibration_session import HELD_FREELY, BoardView, Corners
 from needle_tracker.calibrating.calibration_start import PairsApartError, consistent_views
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.optics.calibration import StereoCalibration
@@ -65,7 +66,6 @@ def test_a_wrong_place_is_found(
 ) -> None:
     number = next(i for i, view in enumerate(views) if view.name == name)
     place = views[number].place
-    assert place is not None
     pose = place.T_rig_board.copy()
     pose[:3, 3] += shift
     wrong = dataclasses.replace(views[number], place=dataclasses.replace(place, T_rig_board=pose))
@@ -74,11 +74,25 @@ def test_a_wrong_place_is_found(
     assert any(text in one for one in contradictions(result))
 
 
+def test_a_board_that_is_not_flat_is_found_although_one_camera_sees_others_alone(
+    box_result: RigCalibration,
+) -> None:
+    residuals, model = box_result.fit.residuals.copy(), box_result.model
+    assert misfits(box_result) == []
+    number = next(number for number, view in enumerate(model.views) if view.name == "box_00")
+    residuals[(model.view_of == number) & model.seen_by["right"]] += 1.0
+    bent = dataclasses.replace(box_result.fit, residuals=residuals)
+    ((view, text),) = misfits(dataclasses.replace(box_result, fit=bent))
+    assert view is model.views[number]
+    assert text.startswith("box_00, right camera: 1.4")
+
+
 def test_a_lens_that_plumb_bob_does_not_describe_is_not_ok(result: RigCalibration) -> None:
     residuals = result.fit.residuals.copy()
-    out = result.model.pixels["right"] - result.calibration.right.camera_matrix[:2, 2]
+    own = result.model.seen_by["right"]
+    out = result.model.pixels[own] - result.calibration.right.camera_matrix[:2, 2]
     away = np.linalg.norm(out, axis=1)[:, None]
-    residuals[-out.size :] += (0.05 * np.sin(away / 50.0) * out / away).ravel()
+    residuals[own] += 0.05 * np.sin(away / 50.0) * out / away
     bent = dataclasses.replace(result, fit=dataclasses.replace(result.fit, residuals=residuals))
     assert 0.03 < ring_patterns(bent)["right"] < 0.06
     (text,) = contradictions(bent)
@@ -110,7 +124,7 @@ def moved(rig: StereoRig, views: list[BoardView], numbers: set[int]) -> list[Boa
         pose, step = free_pose(rng), np.random.default_rng(number).normal(size=3)
         pose[:3, 3] += 0.3e-3 * step / np.linalg.norm(step)
         if number in numbers:
-            right = view_of(rig, "", pose, None, np.random.default_rng(number)).right
+            right = view_of(rig, "", pose, HELD_FREELY, np.random.default_rng(number)).right
             result[number] = dataclasses.replace(views[number], right=right)
     return result
 

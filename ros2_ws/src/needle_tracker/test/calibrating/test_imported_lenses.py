@@ -162,11 +162,13 @@ def test_files_that_are_not_two_cameras_are_rejected(
     ros_files, chain, split, *_ = all_formats(tmp_path, calibration).values()
     broken = tmp_path / "broken.yml"
     broken.write_text(split[1].read_text().replace("data: [", "data: ["[:-1] + "{"))
+    wide = written(tmp_path / "wide.yaml", ros(calibration)[0] | {"image_width": "wide"})
     for paths, cause in (
         (ros_files[:1] * 2, "a file is given twice"),
         (ros_files + chain, "found 4 of 2 cameras"),
         (split[:1], "found 0 of 2 cameras"),
         ([broken], "it is damaged"),
+        ([wide], "wide.yaml, a ROS camera_info of one camera: image_width = 'wide' is not"),
         ([written(tmp_path / "own.yaml", {"phantom": {}})], "is neither a ROS camera_info"),
     ):
         with pytest.raises(UserError, match=cause):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, grey_image
+from needle_core.messages import Image
+from needle_tracker.sources.image_encodings import ENCODINGS, Frame, decoded
 
 # First row of the pattern, then its second: red, green and blue.
 BAYER = {"rggb": "0112", "bggr": "2110", "gbrg": "1201", "grbg": "1021"}
@@ -37,18 +38,35 @@ def encoded(encoding: str, colour: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return ordered.reshape(height, -1)
 
 
+def message(rows: NDArray[np.uint8], encoding: str, width: int = 80) -> Image:
+    height, step = rows.shape
+    return Image(0, "", height, width, encoding, step, rows.reshape(-1).data)
+
+
 def test_brightness_is_that_of_the_scene() -> None:
     y, x = np.mgrid[:60, :80] / 60.0
     channels = [90 + 80 * np.sin(2 * x), 120 + 90 * np.cos(3 * y), 60 + 50 * np.sin(x + 2 * y)]
     colour = np.asarray(np.rint(np.stack(channels, axis=-1)), np.uint8)
     for encoding in ENCODINGS:
-        rows = encoded(encoding, colour)
-        assert rows.shape[1] == 80 * bytes_per_pixel(encoding)
         # Drivers pad rows to whole words.
-        grey = grey_image(np.pad(rows, ((0, 0), (0, 5)), constant_values=255), 80, encoding)
+        rows = np.pad(encoded(encoding, colour), ((0, 0), (0, 5)), constant_values=255)
+        grey = decoded(message(rows, encoding), "left").pixels
+        assert grey is not None
         assert grey.shape == (60, 80)
         off = np.abs(grey.astype(float) - brightness(colour))[2:-2, 2:-2]
         # Colours missing in the pattern are interpolated from the neighbours.
         assert off.max() <= (3.0 if encoding.startswith("bayer_") else 1.0), encoding
     grey_rows = encoded("mono8", colour)
-    assert np.shares_memory(grey_image(grey_rows, 60, "mono8"), grey_rows)
+    pixels = decoded(message(grey_rows, "mono8"), "left").pixels
+    assert pixels is not None
+    assert np.shares_memory(pixels, grey_rows)
+
+
+def test_an_image_without_pixels_or_with_short_rows_is_a_problem() -> None:
+    for shape, width, text in (
+        ((0, 240), 80, "0 bytes in rows of 240, 0 rows of 240"),
+        ((60, 0), 0, "0 bytes in rows of 0, 60 rows of 0"),
+        ((60, 239), 80, "14340 bytes in rows of 239, 60 rows of 240"),
+    ):
+        frame = decoded(message(np.zeros(shape, np.uint8), "rgb8", width), "left")
+        assert frame == Frame(None, f"left image has {text} expected")

@@ -70,18 +70,17 @@ def test_free_running_cameras_pair_within_half_a_frame_and_the_skew_is_reported(
 
 def test_insertion_is_interpolated_at_the_exposure() -> None:
     history = InsertionHistory()
-    assert not history.is_bracketed(0)
+    assert history.latest < 0
     history.add(100, 0.010)
-    assert not history.is_bracketed(101)
+    assert history.latest == 100
     assert history.at(101) is None
     history.add(200, 0.020)
-    assert history.is_bracketed(150)
     for stamp, insertion in ((99, None), (100, 0.010), (130, 0.013), (200, 0.020)):
         assert history.at(stamp) == (insertion and pytest.approx(insertion))
     # The later of two equal stamps counts; a non-finite value does not.
     history.add(200, 0.030)
     history.add(210, math.nan)
-    assert (history.at(200), history.rejected, history.is_bracketed(205)) == (0.030, 1, False)
+    assert (history.at(200), history.rejected, history.latest) == (0.030, 1, 200)
     history.add(50, 0.002)
     assert (history.restarts, history.at(100), history.at(50)) == (1, None, 0.002)
     assert (history.time_before(49), history.time_before(50)) == (1, 0)

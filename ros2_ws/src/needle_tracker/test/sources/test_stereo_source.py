@@ -136,7 +136,7 @@ def test_a_longer_or_cut_off_video_is_reported(tmp_path: Path) -> None:
     left, right = write_video(tmp_path / "left.avi", 6), write_video(tmp_path / "right.avi", 4)
     levels, missing = levels_of(opened(left, right))
     np.testing.assert_allclose(levels, [0, 40, 80, 120], atol=3)
-    assert missing == "2 frames without a partner"
+    assert missing == "2 images without a partner: left 000004, left 000005"
     whole = left.read_bytes()
     for path in (left, right):
         path.write_bytes(whole[: whole.index(b"movi") + (len(whole) - whole.index(b"movi")) // 2])
