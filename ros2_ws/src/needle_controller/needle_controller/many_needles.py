@@ -68,7 +68,8 @@ class ManyFilters:
 
     def start(self, tips: Array) -> None:
         """Start at first tips, (N, 3) [m]."""
-        _start_all(self._needles, self._hypotheses, self._prior, tips, self._assumed)
+        for needle, own, tip in zip(self._needles, self._hypotheses, tips, strict=True):
+            start_needle(needle, own, self._prior, tip, 0.0, 0.0, self._assumed[0])
         self._estimate()
 
     def advance(self, lengths: Array, turns: Array) -> None:
@@ -102,9 +103,7 @@ class ManyFilters:
     def roll_rates(self, settings: RollLawSettings, bend_sign: float) -> Array:
         """Return each base's rotation rate by the roll law, (N,) [rad/m]."""
         turns = np.empty(self.estimates.size)
-        # Contiguous, as in the node: compiled once.
-        uncertainty = np.ascontiguousarray(self.estimates["uncertainty"])
-        _roll_all(self.estimates, uncertainty, self.torsions, bend_sign, settings, turns)
+        _roll_all(self.estimates, self.torsions, bend_sign, settings, turns)
         return turns / settings.step_length
 
     def point_rates(
@@ -117,48 +116,30 @@ class ManyFilters:
 
 
 class ManyObservers:
-    """Observers of N needles, and the law of [KC09]."""
+    """Observers of N needles, whose bases start at 0, and the law of [KC09]."""
 
-    def __init__(
-        self, settings: ObserverSettings, law: LinearizingGains | None, count: int
-    ) -> None:
-        self._settings, self._law = settings, law
+    def __init__(self, settings: ObserverSettings, count: int) -> None:
+        self._settings = settings
         self._needles = np.zeros(count, OBSERVER)
 
-    def start(self, tips: Array) -> Array:
-        """Start at first tips, (N, 3) [m], the bases at 0; return the rates, (N,) [rad/m]."""
+    def start(self, tips: Array) -> None:
+        """Start at first tips, (N, 3) [m]."""
         self._needles["linearized"][:, 0] = tips[:, 0]
-        return self._rates()
 
-    def step(
-        self, lengths: Array, unturned: Array, turns: Array, tips: Array, ages: Array
-    ) -> Array:
-        """Advance by a step, correct by its tips; return the rotation rates, (N,) [rad/m].
+    def advance(self, lengths: Array, turns: Array) -> None:
+        """Advance by inserted lengths [m] and rotations of the bases [rad], (N,)."""
+        _advance_observers(self._needles, lengths, turns, self._settings)
 
-        Parameters
-        ----------
-        lengths, unturned, turns : ndarray, shape (N,)
-            Inserted length, its part before the base begins to turn [m], and rotation [rad].
-        tips, ages : ndarray, shape (N, 3), (N,)
-            See `ManyFilters.correct`.
-        """
-        _step_observers(self._needles, lengths, unturned, turns, tips, ages, self._settings)
-        return self._rates()
+    def correct(self, tips: Array, _covariance: Array | None, ages: Array) -> None:
+        """Correct by tips, (N, 3), of ages (N,); the constant gain does not use a covariance."""
+        _correct_observers(self._needles, tips, ages, self._settings)
 
-    def _rates(self) -> Array:
+    def rates(self, law: LinearizingGains | None) -> Array:
+        """Return each base's rotation rate by the law of [KC09], (N,) [rad/m]; without one, 0."""
         rates = np.zeros(self._needles.size)
-        if self._law is not None:
-            linearized = np.ascontiguousarray(self._needles["linearized"])
-            _linearizing_all(linearized, self._settings.curvature, self._law, rates)
+        if law is not None:
+            _linearizing_all(self._needles, self._settings.curvature, law, rates)
         return rates
-
-
-@compiled
-def _start_all(
-    needles: Records, hypotheses: Records, prior: Records, tips: Array, assumed: Records
-) -> None:
-    for n in range(needles.size):
-        start_needle(needles[n], hypotheses[n], prior, tips[n], 0.0, 0.0, assumed[0])
 
 
 @parallel
@@ -201,17 +182,13 @@ def _estimate_all(
 @compiled
 def _roll_all(
     estimates: Records,
-    uncertainty: Array,
     torsions: Records,
     bend_sign: float,
     settings: RollLawSettings,
     turns: Array,
 ) -> None:
     for n in range(estimates.size):
-        s, base, wound = estimates[n].linearized, estimates[n].base, estimates[n].wound
-        turns[n] = roll_turn(
-            s[0], s[1], uncertainty[n], torsions[n], base, wound, bend_sign, settings
-        )[0]
+        turns[n] = roll_turn(estimates[n], torsions[n], bend_sign, settings)[0]
 
 
 @compiled
@@ -225,37 +202,27 @@ def _point_all(
     left: Array,
 ) -> None:
     for n in range(estimates.size):
-        estimate = estimates[n]
         turns[n], left[n] = point_turn(
-            estimate.coordinates,
-            estimate.curvature,
-            estimate.uncertainty,
-            torsions[n],
-            estimate.base,
-            estimate.wound,
-            targets[n],
-            rotation_left[n],
-            settings,
+            estimates[n], torsions[n], targets[n], rotation_left[n], settings
         )
 
 
 @compiled
-def _step_observers(
-    needles: Records,
-    lengths: Array,
-    unturned: Array,
-    turns: Array,
-    tips: Array,
-    ages: Array,
-    settings: ObserverSettings,
+def _advance_observers(
+    needles: Records, lengths: Array, turns: Array, settings: ObserverSettings
+) -> None:
+    for n in range(needles.size):
+        advance_observer(needles[n], lengths[n], turns[n], settings)
+
+
+@compiled
+def _correct_observers(
+    needles: Records, tips: Array, ages: Array, settings: ObserverSettings
 ) -> None:
     # Most steps have the same length, and so the same gain.
     since, gain = 0.0, (0.0, 0.0, 0.0)
     for n in range(needles.size):
         needle = needles[n]
-        if unturned[n] > 0.0:
-            advance_observer(needle, unturned[n], 0.0, settings)
-        advance_observer(needle, lengths[n] - unturned[n], turns[n], settings)
         if math.isfinite(tips[n, 0] + tips[n, 1] + tips[n, 2]):
             if needle.since_correction != since:
                 since = needle.since_correction
@@ -265,10 +232,10 @@ def _step_observers(
 
 @compiled
 def _linearizing_all(
-    linearized: Array, curvature: float, law: LinearizingGains, rates: Array
+    needles: Records, curvature: float, law: LinearizingGains, rates: Array
 ) -> None:
     for n in range(rates.size):
-        s = linearized[n]
+        s = needles[n].linearized
         # Roll of s, the inverse of (6)
         sine = s[2] / curvature
         roll = math.atan2(sine, math.sqrt(1.0 - s[1] * s[1] - sine * sine))

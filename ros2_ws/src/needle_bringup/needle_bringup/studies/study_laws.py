@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from needle_bringup.studies.study_estimators import Estimators
+from needle_bringup.studies.study_estimators import PoseEstimators
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.laws.point_turns import PointLawSettings
@@ -36,11 +36,11 @@ PointLaws = Callable[[Any, FloatArray, FloatArray], tuple[FloatArray, FloatArray
 [rad/m] and remaining insertions [m], (N,)."""
 
 
-def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[Estimators, float], FloatArray]:
+def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[PoseEstimators, float], FloatArray]:
     """Return a function for the rotation rates from laws that are called one by one."""
     laws: list[StepLaw] = []
 
-    def rates(estimators: Estimators, insertion: float) -> FloatArray:
+    def rates(estimators: PoseEstimators, insertion: float) -> FloatArray:
         known = estimators.each()
         laws.extend(new_law(n) for n in range(len(laws), len(known)))
         return np.array(
@@ -63,7 +63,7 @@ def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], Timed
     laws: list[tuple[TargetMotion, TimedLaw]] = []
 
     def commands(
-        estimators: Estimators, insertion: FloatArray, rotation_left: FloatArray
+        estimators: PoseEstimators, insertion: FloatArray, rotation_left: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         known = estimators.each()
         for _ in range(len(laws), len(known)):

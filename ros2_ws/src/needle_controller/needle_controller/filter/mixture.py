@@ -267,7 +267,5 @@ def estimate_from_record(
         covariance=to_angles @ record["covariance"] @ to_angles.T,
         warnings=warnings,
         miss=float(record["miss"]),
-        hypotheses=Hypotheses(
-            torsions, float(record["base"]), float(record["wound"]), record["uncertainty"]
-        ),
+        hypotheses=Hypotheses(record, torsions),
     )

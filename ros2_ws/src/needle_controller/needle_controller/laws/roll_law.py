@@ -8,8 +8,6 @@ the rotation of the base that turns the tip through play and lag; the mean over 
 used.
 """
 
-# Numba functions take positional arguments: keywords are slow or unsupported.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
@@ -18,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.filter.records import TORSION
+from needle_controller.filter.records import ESTIMATE, TORSION
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import PITCH, ROLL, X
@@ -119,19 +117,9 @@ class RollLaw:
             the nearer one. A change of sign is a turn by pi - 2 roll, which preserves the component
             of the curvature normal to the plane.
         """
-        known, s = hypotheses_of(estimate), estimate.linearized
-        turn, desired = roll_turn(
-            float(s[0]),
-            float(s[1]),
-            known.uncertainty,
-            known.torsions,
-            known.base,
-            known.wound,
-            float(bend_sign),
-            self.settings,
-        )
+        turn, desired = roll_turn(*hypotheses_of(estimate), float(bend_sign), self.settings)
         length = self.settings.step_length
-        return SteeringCommand((desired - float(s[2])) / length, turn / length)
+        return SteeringCommand((desired - float(estimate.linearized[2])) / length, turn / length)
 
 
 def hypotheses_of(estimate: Estimate) -> Hypotheses:
@@ -141,35 +129,26 @@ def hypotheses_of(estimate: Estimate) -> Hypotheses:
     """
     if estimate.hypotheses is not None:
         return estimate.hypotheses
-    only = np.zeros(1, TORSION)
+    only, mean = np.zeros(1, TORSION), np.zeros(1, ESTIMATE)[0]
     only["roll"], only["curvature"] = estimate.coordinates[ROLL], estimate.curvature
     only["agreement"] = only["weight"] = only["gain"] = 1.0
-    covariance, cosine = estimate.covariance, math.cos(float(estimate.coordinates[PITCH]))
+    p, cosine = estimate.covariance, math.cos(float(estimate.coordinates[PITCH]))
+    mean["coordinates"], mean["linearized"] = estimate.coordinates, estimate.linearized
+    mean["curvature"] = estimate.curvature
     # d sin(pitch) = cos(pitch) dpitch
-    uncertainty = np.array(
-        [covariance[X, X], covariance[X, PITCH] * cosine, covariance[PITCH, PITCH] * cosine**2]
-    )
-    return Hypotheses(only, 0.0, 0.0, uncertainty)
+    mean["uncertainty"] = p[X, X], p[X, PITCH] * cosine, p[PITCH, PITCH] * cosine**2
+    return Hypotheses(mean, only)
 
 
 @compiled
 def roll_turn(
-    x: float,
-    sin_pitch: float,
-    uncertainty: Array,
-    torsions: Records,
-    base: float,
-    wound: float,
-    bend_sign: float,
-    settings: RollLawSettings,
+    estimate: Any, torsions: Records, bend_sign: float, settings: RollLawSettings
 ) -> tuple[float, float]:
     """Return the rotation of the base over the next step [rad] and the desired s3 [1/m].
 
     Parameters
     ----------
-    x, sin_pitch : float
-        Distance from the plane [m] and sine of the pitch, over all hypotheses.
-    uncertainty, torsions, base, wound :
+    estimate, torsions : ESTIMATE, ndarray of TORSION
         See `Hypotheses`.
     bend_sign : float
         Desired sign of cos(roll); 0 for either.
@@ -178,18 +157,19 @@ def roll_turn(
     """
     limit = settings.max_rotation_per_length * settings.step_length
     least = settings.smallest_weight * torsions["weight"].max()
+    x, sin_pitch = estimate.linearized[0], estimate.linearized[1]
     turns = weights = s3_mean = 0.0
     for k in range(torsions.size):
         t = torsions[k]
         if t.weight < least or t.weight == 0.0:
             continue
-        s3, sine = desired_bend(x, sin_pitch, uncertainty, t, settings)
-        tip_turn = nearest_turn(t.roll, sine, bend_sign, wound, settings.max_winding)
+        s3, sine = desired_bend(x, sin_pitch, estimate.uncertainty, t, settings)
+        tip_turn = nearest_turn(t.roll, sine, bend_sign, estimate.wound, settings.max_winding)
         dead_band = settings.far_dead_band if abs(x) > settings.near else settings.near_dead_band
         dead_band += settings.scatter_dead_band * (1.0 - t.agreement)
         if abs(tip_turn) < dead_band:
             tip_turn = 0.0
-        rotation = base_turn(t, tip_turn, base, settings.step_length)
+        rotation = base_turn(t, tip_turn, estimate.base, settings.step_length)
         turns += t.weight * min(max(rotation, -settings.largest_turn), settings.largest_turn)
         s3_mean += t.weight * s3
         weights += t.weight

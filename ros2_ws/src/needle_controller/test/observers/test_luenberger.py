@@ -119,13 +119,15 @@ def test_many_needles_equal_single_ones() -> None:
     turns = rng.normal(0.0, 0.1, (20, count))
     tips[3, 2] = np.nan
     gains = SETTINGS.gains()
-    many = ManyObservers(observer_settings(SETTINGS, gains), law().gains, count)
+    many = ManyObservers(observer_settings(SETTINGS, gains), count)
     every = [observer() for _ in range(count)]
     many.start(tips[0].copy())
     for n, one in enumerate(every):
         one.reset(tips[0, n], np.zeros(2))
     for tip, turn in zip(tips[1:], turns[1:], strict=True):
-        rates = many.step(np.full(count, STEP), np.zeros(count), turn, tip, np.zeros(count))
+        many.advance(np.full(count, STEP), turn)
+        many.correct(tip, None, np.zeros(count))
+        rates = many.rates(law().gains)
         for n, one in enumerate(every):
             one.advance(STEP, turn[n])
             one.correct(tip[n])
