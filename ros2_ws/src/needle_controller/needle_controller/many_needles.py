@@ -49,6 +49,8 @@ class ManyFilters:
 
     Attributes
     ----------
+    needles : ndarray of NEEDLE, shape (N,)
+        Their states.
     estimates, torsions : ndarray of ESTIMATE, TORSION, shape (N,), (N, K)
         Present estimates.
     """
@@ -57,9 +59,9 @@ class ManyFilters:
         self._settings, self._prior = settings, settings.prior()
         # An array: parallel loops cannot take a single record.
         self._assumed = np.array([settings.assumptions()])
-        self._needles = np.zeros(count, NEEDLE)
-        self._needles["initial_rotation"] = np.eye(3)
-        self._needles["has_entry"] = True
+        self.needles = np.zeros(count, NEEDLE)
+        self.needles["initial_rotation"] = np.eye(3)
+        self.needles["has_entry"] = True
         self._hypotheses = np.empty((count, self._prior.size + 1), HYPOTHESIS)
         # A step has two advances if the base begins to turn within it.
         self._events = np.zeros((count, 2 * math.ceil(LAST / shortest_step) + 4), EVENT)
@@ -68,18 +70,20 @@ class ManyFilters:
 
     def start(self, tips: Array) -> None:
         """Start at first tips, (N, 3) [m]."""
-        for needle, own, tip in zip(self._needles, self._hypotheses, tips, strict=True):
+        for needle, own, tip in zip(self.needles, self._hypotheses, tips, strict=True):
             start_needle(needle, own, self._prior, tip, 0.0, 0.0, self._assumed[0])
-        self._estimate()
+        every = zip(self.needles, self._hypotheses, self.estimates, self.torsions, strict=True)
+        for records in every:
+            estimate_needle(*records, self._assumed[0])
 
     def advance(self, lengths: Array, turns: Array) -> None:
         """Advance by inserted lengths [m] and rotations of the bases [rad], (N,)."""
-        _advance_all(self._needles, self._hypotheses, self._events, lengths, turns, self._assumed)
+        _advance_all(self.needles, self._hypotheses, self._events, lengths, turns, self._assumed)
 
     def correct(self, tips: Array, covariance: Array | None, ages: Array) -> None:
         """Correct by tips, (N, 3), with their covariance, (3, 3), and ages, (N,)."""
         _correct_all(
-            self._needles,
+            self.needles,
             self._hypotheses,
             self._events,
             self._prior,
@@ -87,11 +91,9 @@ class ManyFilters:
             self._settings.tip_covariance(covariance),
             ages,
             self._assumed,
+            self.estimates,
+            self.torsions,
         )
-        self._estimate()
-
-    def _estimate(self) -> None:
-        _estimate_all(self._needles, self._hypotheses, self.estimates, self.torsions, self._assumed)
 
     def each(self) -> list[Estimate]:
         """Return the estimates as `Estimate`."""
@@ -165,18 +167,13 @@ def _correct_all(
     covariance: Array,
     ages: Array,
     assumed: Records,
+    estimates: Records,
+    torsions: Records,
 ) -> None:
     for n in prange(needles.size):
         needle, own = needles[n], hypotheses[n]
         correct_needle(needle, own, events[n], prior, tips[n], covariance, ages[n], assumed[0])
-
-
-@parallel
-def _estimate_all(
-    needles: Records, hypotheses: Records, estimates: Records, torsions: Records, assumed: Records
-) -> None:
-    for n in prange(needles.size):
-        estimate_needle(needles[n], hypotheses[n], estimates[n], torsions[n], assumed[0])
+        estimate_needle(needle, own, estimates[n], torsions[n], assumed[0])
 
 
 @compiled

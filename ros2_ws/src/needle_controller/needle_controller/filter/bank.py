@@ -240,9 +240,9 @@ def correct_needle(
     age : float
         Stated insertion since the exposure of the tip [m].
     """
-    reading = new_reading()
-    _set_reading(reading, tip, covariance, needle.heading)
+    heading = needle.heading.copy()
     needle.heading[3] = 0.0
+    reading = new_reading(tip, covariance, heading)
     _apply_tip(needle, hypotheses, reading, age + needle.late, assumed)
     if needle.events < 0:
         return
@@ -257,7 +257,7 @@ def correct_needle(
         for j in range(3):
             event.covariance[i, j] = covariance[i, j]
     for i in range(4):
-        event.heading[i] = reading.heading[i]
+        event.heading[i] = heading[i]
     if needle.inserted < LAST:
         return
     count, needle.events = needle.events, -1
@@ -269,7 +269,7 @@ def correct_needle(
             event = events[k]
             _queue(needle, hypotheses, event.length, event.turn, assumed)
             if event.is_tip:
-                _set_reading(reading, event.tip, event.covariance, event.heading)
+                reading = new_reading(event.tip, event.covariance, event.heading)
                 _apply_tip(needle, hypotheses, reading, event.age + needle.late, assumed)
 
 
@@ -289,17 +289,6 @@ def _estimated_age(needle: Any, events: Records, assumed: Any) -> float:
         for i in range(3):
             too_deep += (needle.start[i] - needle.entry[i]) * needle.initial_rotation[i, 2]
     return hidden_age(inserted, shifts, too_deep, entry_std, assumed.effective_bound)
-
-
-@compiled
-def _set_reading(reading: Reading, tip: Array, covariance: Array, heading: Array) -> None:
-    """Set a tip, its covariance and the heading measured with it."""
-    for i in range(3):
-        reading.tip[i] = tip[i]
-        for j in range(3):
-            reading.covariance[i, j] = covariance[i, j]
-    for i in range(4):
-        reading.heading[i] = heading[i]
 
 
 @compiled

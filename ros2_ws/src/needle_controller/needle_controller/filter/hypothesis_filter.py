@@ -17,6 +17,14 @@ from needle_controller.filter.records import ERROR, ESTIMATE, EVENT, HYPOTHESIS,
 from needle_controller.observers.estimator import Estimate
 
 AMBIGUOUS_WEIGHT = 0.1
+MAX_OUTLIERS = 0.35
+"""Largest acceptable share of outliers among about the last ten tips."""
+LARGEST_NOISE = 3.0
+"""Largest acceptable noise, relative to the claimed one."""
+LARGEST_SLIP = 0.15
+"""Largest acceptable distance of the insertion scale from 1."""
+_AT_LIMIT = 0.03
+LATE = "tips lag the insertion from the start: late tips or a stuck needle; assumed late"
 _EVENTS = 4096
 """Largest number of recorded events of the first 2 cm, for the detection of late tips."""
 
@@ -120,7 +128,7 @@ class HypothesisFilter:
         record = np.zeros(1, ESTIMATE)[0]
         torsions = np.zeros(len(self.settings.torsion_hypotheses), TORSION)
         estimate_needle(self.needle, self._hypotheses, record, torsions, self._assumed)
-        return estimate_from_record(record, torsions, self._warnings(float(record["ambiguous"])))
+        return estimate_from_record(record, torsions, self._warnings(record))
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
         """Transform everything into another target plane; see `Estimator.change_frame`."""
@@ -141,12 +149,20 @@ class HypothesisFilter:
         events["covariance"] = turn @ events["covariance"] @ turn.T
         events["heading"][:, :3] = events["heading"][:, :3] @ turn.T
 
-    def _warnings(self, ambiguous: float) -> tuple[str, ...]:
-        warnings = []
-        if ambiguous > AMBIGUOUS_WEIGHT:
-            warnings.append(f"the roll is ambiguous: {100.0 * ambiguous:.0f} % for another value")
-        if self.needle["outlier_probability"] > 0.5:
-            warnings.append("tip refused as an outlier")
-        if self.needle["tip_too_late"]:
-            warnings.append("tip dropped: it is older than the last one used")
-        return tuple(warnings)
+    def _warnings(self, mean: np.void) -> tuple[str, ...]:
+        needle, assumed, ambiguous = self.needle, self._assumed, mean["ambiguous"]
+        margin = _AT_LIMIT * assumed["curvature"]
+        low, high = assumed["smallest_curvature"] + margin, assumed["largest_curvature"] - margin
+        warnings = {
+            f"the roll is ambiguous: {100.0 * ambiguous:.0f} % for another value": (
+                ambiguous > AMBIGUOUS_WEIGHT
+            ),
+            "tip refused as an outlier": needle["outlier_probability"] > 0.5,
+            "tip dropped: it is older than the last one used": needle["tip_too_late"],
+            "too many tips are outliers": needle["mean_outlier_probability"] > MAX_OUTLIERS,
+            "tips are far noisier than claimed": mean["noise"] > LARGEST_NOISE,
+            "the needle does not advance with the stage": abs(mean["scale"] - 1.0) > LARGEST_SLIP,
+            "the curvature is at its limit": not low <= mean["curvature"] <= high,
+            LATE: needle["late"] > 0.0,
+        }
+        return tuple(text for text, applies in warnings.items() if applies)

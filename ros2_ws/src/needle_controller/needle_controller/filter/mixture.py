@@ -19,24 +19,8 @@ from needle_core.compiled import compiled
 
 Records = npt.NDArray[np.void]
 
-LATE = "tips lag the insertion from the start: late tips or a stuck needle; assumed late"
-WARNINGS = (
-    "too many tips are outliers",
-    "tips are far noisier than claimed",
-    "the needle does not advance with the stage",
-    "the curvature is at its limit",
-    LATE,
-)
-"""Warnings of an estimate, in the order of their bits."""
-MAX_OUTLIER_PROBABILITY = 0.35
-"""Largest acceptable share of outliers among about the last ten tips."""
-LARGEST_NOISE = 3.0
-"""Largest acceptable noise, relative to the claimed one."""
-LARGEST_SLIP = 0.15
-"""Largest acceptable distance of the insertion scale from 1."""
 HIDDEN_SHARE = 0.5
 """Assumed systematic part of a claimed variance that the tips do not reveal."""
-_AT_LIMIT = 0.03
 _AMBIGUOUS_COSINE = math.cos(math.radians(60.0))
 _NO_MEAN_ROLL = 0.1
 
@@ -112,7 +96,6 @@ def estimate_needle(
         estimate.base += needle.pending_turn[k]
     estimate.wound = estimate.base + needle.start_turn
     estimate.miss = miss
-    estimate.warnings = _warnings(needle, estimate, assumed)
     _average_torsions(every, whole, torsions)
     _write_covariance(needle, every, whole, estimate, assumed)
 
@@ -161,20 +144,6 @@ def _noise_size(h: Any, noises: Array) -> float:
             size += h.noise_weights[i, m] * noises[h.shape, 0, m]
         largest = max(largest, size)
     return largest
-
-
-@compiled
-def _warnings(needle: Any, estimate: Any, assumed: Any) -> int:
-    """Return the active `WARNINGS` as bits."""
-    low, high = assumed.smallest_curvature, assumed.largest_curvature
-    margin = _AT_LIMIT * assumed.curvature
-    return int(
-        (needle.mean_outlier_probability > MAX_OUTLIER_PROBABILITY)
-        + 2 * (estimate.noise > LARGEST_NOISE)
-        + 4 * (abs(estimate.scale - 1.0) > LARGEST_SLIP)
-        + 8 * (estimate.curvature < low + margin or estimate.curvature > high - margin)
-        + 16 * (needle.late > 0.0)
-    )
 
 
 @compiled
@@ -256,7 +225,6 @@ def estimate_from_record(
     record: np.void, torsions: Records, warnings: tuple[str, ...] = ()
 ) -> Estimate:
     """Return the `Estimate` of a record, an ESTIMATE with its TORSION, shape (K,)."""
-    warnings += tuple(why for k, why in enumerate(WARNINGS) if record["warnings"] >> k & 1)
     # A change of the angles turns the tip by axes @ change.
     to_angles = np.eye(6)
     to_angles[3:, 3:] = np.linalg.inv(angle_axes(record["coordinates"][3:]))

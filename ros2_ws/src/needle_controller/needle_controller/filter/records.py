@@ -95,7 +95,6 @@ ESTIMATE = np.dtype(
         ("ambiguous", np.float64),  # weight of rolls more than 60 deg from the likeliest
         ("base", np.float64),  # rotation of the base since the start [rad]
         ("wound", np.float64),  # position of the rotation joint [rad]
-        ("warnings", np.int64),  # bit k: number k of `WARNINGS`
     ]
 )
 TORSION = np.dtype(
