@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.stats import norm
 
 from needle_controller.filter.records import ESTIMATE, TORSION
-from needle_controller.laws.flip_plan import FlipPlan
+from needle_controller.laws.flip_plan import bend_sign
 from needle_controller.laws.roll_law import RollLawSettings, roll_turn
 from needle_controller.observers.luenberger import INITIAL_ROLL_STD
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -60,7 +60,7 @@ class EkfNeedles:
     ) -> None:
         known = SteeringSettings(step_length=step_length, flip_depths=flip_depths, depth=1.0)
         self._law = RollLawSettings(**known.turning)
-        self._plan = FlipPlan(flip_depths)
+        self._flips = flip_depths
         angles = (known.entry_angle_std, known.entry_angle_std, INITIAL_ROLL_STD)
         spread = [tip_std] * 3 + [*angles, CURVATURE_SPREAD * known.curvature]
         self._prior = np.diag(np.square(spread))
@@ -107,7 +107,7 @@ class EkfNeedles:
 
     def _rates(self) -> FloatArray:
         turns = np.empty(self._needles.size)
-        sign = self._plan.bend_sign(self._insertion)
+        sign = bend_sign(self._flips, self._insertion)
         mean, only = np.zeros(1, ESTIMATE)[0], np.zeros(1, TORSION)
         _turn_all(self._needles, mean, only, sign, self._law, turns)
         return turns / self._law.step_length

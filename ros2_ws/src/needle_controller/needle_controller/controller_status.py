@@ -1,4 +1,4 @@
-"""Content of needle/controller_status, including the log of received messages.
+"""Content of needle/controller_status, and its log of received messages (`heard`).
 
 A node on a busy machine receives a message some time after it was sent, possibly after later ones;
 messages that exceed its queue are lost. With the log, a bag can be replayed in the order of
@@ -17,8 +17,6 @@ from needle_core.diagnostics import Level
 from needle_core.status_messages import ControllerStatus
 
 _LEVELS = {SteeringState.FAULT: Level.ERROR, SteeringState.WAITING_FOR_TIP: Level.WARN}
-_LOG_LENGTH = 100
-"""Largest number of messages in one log: one or two seconds of a rig at rest."""
 _LOGGED = re.compile(r"(\S+) (\d{1,19})")
 
 
@@ -43,8 +41,8 @@ def controller_status(steering: Steering, source: str) -> ControllerStatus:
         target_offset_m=control.plane.offset,
         target_point_m=target,
         obstacles=len(control.obstacles),
-        reachable=None if reach is None else bool(reach.reachable),
-        reachable_depth_m=None if reach is None else float(reach.depth),
+        reachable=None if reach is None else reach.reachable,
+        reachable_depth_m=None if reach is None else reach.depth,
         trusted=confidence.verdict,
         r1_low_m=_finite(confidence.low),
         r1_high_m=_finite(confidence.high),
@@ -72,29 +70,7 @@ class ReceivedMessage(NamedTuple):
     sent_ns: int
 
 
-class ReceptionLog:
-    """Messages received since the last published status, in order."""
-
-    def __init__(self) -> None:
-        self._messages: list[ReceivedMessage] = []
-
-    def add(self, topic: str, sent_ns: int) -> None:
-        """Add a received message."""
-        self._messages.append(ReceivedMessage(topic, sent_ns))
-
-    @property
-    def is_full(self) -> bool:
-        """Whether the log must be published."""
-        return len(self._messages) >= _LOG_LENGTH
-
-    def pop_text(self) -> str:
-        """Return the log as text, and clear it."""
-        text = ", ".join(f"{topic} {sent_ns}" for topic, sent_ns in self._messages)
-        self._messages.clear()
-        return text
-
-
 def received_messages(text: str) -> list[ReceivedMessage]:
-    """Return the messages of `ReceptionLog.pop_text`."""
+    """Return the messages of a log, such as `joint_states 1700000000, needle/tip 5`."""
     found = map(_LOGGED.fullmatch, text.split(", "))
     return [ReceivedMessage(match[1], int(match[2])) for match in found if match is not None]

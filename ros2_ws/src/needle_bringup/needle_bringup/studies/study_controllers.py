@@ -215,8 +215,7 @@ def controller_factory(
     """
     settings, covariance = _claimed_settings(name, claimed, sigma_scale, flip_depths, own)
     if name in ONE_SIDED_PRESETS and not settings.estimator and not settings.law:
-        gains = settings.gains()
-        known, law = observer_settings(settings, gains), make_law(settings, gains)
+        known, law = observer_settings(settings), make_law(settings)
         weights = law.gains if isinstance(law, LinearizingLaw) else None
         return lambda: SteeredNeedles(
             lambda count: PaperObservers(known, count),

@@ -13,10 +13,9 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import PITCH, YAW, X
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate
-from needle_controller.planning.entry import entry_state, first_path
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_evaluation import PathSettings
-from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
+from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState, entry_state
 from needle_controller.presets.own_parts import OwnPart, own_part
 from needle_controller.presets.point_steering import prompt_point_law
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -166,7 +165,7 @@ class PathSteering:
                 f"planner {self._own.part.name} finds no path to the target point past "
                 f"{len(obstacles)} obstacles"
             )
-        found = first_path(self._planner, entry, target, obstacles)
+        found = self._planner.first_path(entry, target, obstacles)
         self.path = None if isinstance(found, str) else found
         return found if isinstance(found, str) else ""
 
@@ -193,8 +192,9 @@ class PathSteering:
         insertion : float
             Present insertion [m].
         """
-        route = self.route(tip_state(estimate, plane), target, obstacles, insertion)
-        self.last_route = route
+        route = self.last_route = self._route(
+            tip_state(estimate, plane), target, obstacles, insertion
+        )
         if route is None:
             return None
         command = self._law(estimate, plane.from_rig(route.aim))
@@ -202,10 +202,9 @@ class PathSteering:
             return command
         return SteeringCommand(command.virtual_input, command.rotation_rate, route.length)
 
-    def route(
+    def _route(
         self, tip: TipState, target: Array, obstacles: Obstacles, insertion: float
     ) -> Route | None:
-        """Return the route from a tip; None if no path is clear; see `command`."""
         if self._own is not None:
             return self._own.route(tip, target, obstacles)
         path = self.path = self._planner.path(

@@ -13,7 +13,7 @@ from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import WINDOW, TargetMotion
 from needle_controller.observers.estimator import Estimate
-from needle_controller.presets.own_law import OwnLaw, checked_law
+from needle_controller.presets.own_controllers import OwnLaw, checked_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 _ITERATIONS = 4

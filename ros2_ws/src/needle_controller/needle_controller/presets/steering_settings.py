@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.laws.flip_plan import FlipPlan
+from needle_controller.laws.flip_plan import check_flips
 from needle_controller.model.arrays import Array
 from needle_controller.model.gains import Gains, design_gains
 from needle_controller.model.reachability import check_plane, check_point
@@ -21,10 +21,6 @@ from needle_core.settings.parameter_fields import check_fields, fixed_parameter,
 ONE_SIDED_PRESETS = ("paper", "open_loop")
 """Presets whose coordinates are limited to roll +-90 deg: they cannot steer to a point."""
 PRESETS = ("best", *ONE_SIDED_PRESETS)
-INSERTIONS = ("stepwise", "continuous")
-TIP_NOISES = ("bounded", "normal")
-TIP_COVARIANCES = ("configured", "from_tip_pose")
-"""Sources of a tip's covariance."""
 _HEADING_NEEDS = "tip_covariance from_tip_pose, and preset best or an own estimator"
 PAPER_NOISE: dict[str, Any] = {
     "tip_covariance": "configured",
@@ -105,7 +101,7 @@ class SteeringSettings:
         "-",
         "stepwise: the needle rests after each step until its tip is measured; continuous: it "
         "advances during the hold, and every tip updates the path ahead.",
-        choices=INSERTIONS,
+        choices=("stepwise", "continuous"),
     )
     horizon: float = parameter(
         0.002,
@@ -148,7 +144,7 @@ class SteeringSettings:
         "from_tip_pose: the covariance of the needle/tip_pose with the tip's stamp, plus "
         "measurement_std squared; a tip without one is rejected. configured: the noise of "
         "tip_noise, for a source that only publishes needle/tip.",
-        choices=TIP_COVARIANCES,
+        choices=("configured", "from_tip_pose"),
     )
     measured_heading: bool = fixed_parameter(
         False,
@@ -177,7 +173,7 @@ class SteeringSettings:
         "-",
         "Noise of each coordinate if tip_covariance is configured. bounded: errors up to "
         "tip_noise_bound (best uses this bound); normal: standard deviation measurement_std.",
-        choices=TIP_NOISES,
+        choices=("bounded", "normal"),
     )
     tip_noise_bound: float = parameter(
         0.001,
@@ -247,7 +243,7 @@ class SteeringSettings:
             self.check_point(self.target_point)
         if len(self.obstacles) % 7:
             raise UserError(f"obstacles has {len(self.obstacles)} numbers, expected 7 for each")
-        FlipPlan(self.flip_depths).check_within(self.depth)
+        check_flips(self.flip_depths, self.depth)
         if self.flip_depths and self.law:
             raise UserError(f"flip_depths apply to the law of best only, not to law {self.law}")
         if self.flip_depths and self.preset in ONE_SIDED_PRESETS:

@@ -10,8 +10,8 @@ from needle_controller.protocol.actions import Action, SendStep
 from needle_controller.protocol.joint_history import JointHistory, JointSample
 from needle_core.component import Log
 
-REST_INSERTION, REST_ROTATION = 2e-6, 1e-4
-"""Largest change of a joint at rest [m], [rad]."""
+_REST_ROTATION = 1e-4
+"""Largest change of the rotation at rest [rad]."""
 MAX_ABORTS_AT_REST = 10
 """Consecutive commands without motion after which the controller gives up."""
 MAX_UNFOLLOWED_STEPS = 3
@@ -84,7 +84,7 @@ class StepMonitor:
         if sample is None or sample.sent_ns < self._answered_ns:
             return StepOutcome.PENDING
         standing = self._standing
-        if standing and not sample.is_near(standing[0], REST_INSERTION, REST_ROTATION):
+        if standing and not sample.is_at_rest(standing[0], _REST_ROTATION):
             standing.clear()
         standing.append(sample)
         if len(standing) < _STANDSTILL_SAMPLES:
@@ -268,8 +268,4 @@ class Watchdog:
     def has_moved(self, latest: JointSample | None) -> bool:
         """Return whether the insertion has changed since the last call."""
         before, self._last_joints = self._last_joints, latest
-        return (
-            latest is not None
-            and before is not None
-            and abs(latest.insertion - before.insertion) > REST_INSERTION
-        )
+        return not (latest is None or before is None or latest.is_at_rest(before))

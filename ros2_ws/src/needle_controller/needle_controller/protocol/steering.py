@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from needle_controller.model.reachability import Reachability
 from needle_controller.presets.own_parts import OwnPartError
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import (
@@ -30,16 +29,16 @@ from needle_controller.protocol.motion_monitors import (
     StepOutcome,
     Watchdog,
 )
-from needle_controller.protocol.plane_control import ControlUpdate, PlaneControl
+from needle_controller.protocol.plane_control import ControlUpdate, PlaneControl, Reachability
 from needle_controller.protocol.start_conditions import is_out, reason_not_to_start
 from needle_controller.protocol.tip_checks import (
     AcceptedTip,
     RejectedTip,
     TipCovariance,
-    TipMeasurement,
 )
 from needle_controller.protocol.tip_queue import TipQueue
 from needle_core.component import Log
+from needle_core.messages import Point
 from needle_core.status_messages import DeviceStatus
 
 _STOPPED_DEVICE = ("FAULT", "ESTOPPED")
@@ -144,7 +143,7 @@ class Steering:
             actions += self._on_retraction(sample)
         return actions + self._check_step(sample) + self._use_tips()
 
-    def on_tip(self, tip: TipMeasurement) -> list[Action]:
+    def on_tip(self, tip: Point) -> list[Action]:
         """Handle a measured tip: use it, queue it until its other data arrive, or reject it."""
         awaited = self._steering and self.awaiting is Awaiting.TIP
         rejection = self.tips.add(tip, self.settings, steering=self._steering, awaited=awaited)
