@@ -13,11 +13,11 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import PITCH, YAW, X
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate
-from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.obstacles import Obstacles
 from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState, entry_state
 from needle_controller.presets.own_parts import OwnPart, own_part
-from needle_controller.presets.point_steering import prompt_point_law
+from needle_controller.presets.point_steering import point_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 _VIA_POINTS = "via points x, y, z in rig [m], the target last"
@@ -110,12 +110,6 @@ def path_planner(settings: SteeringSettings) -> PathPlanner:
     )
 
 
-def configured_obstacles(settings: SteeringSettings) -> Obstacles:
-    """Return the obstacles of the settings; raises UserError as `Obstacles` does."""
-    rows = np.reshape(settings.obstacles, (-1, 7))
-    return Obstacles([Obstacle(row[:3], row[3:6], row[6]) for row in rows])
-
-
 class PathSteering:
     """Steers one needle around obstacles.
 
@@ -138,7 +132,7 @@ class PathSteering:
         self._own = None
         if settings.planner:
             self._own = OwnPlanner(checked_planner(settings.planner), settings)
-        self._law = prompt_point_law(settings)
+        self._law = point_law(settings, is_prompt=True)
         self.path: NeedlePath | None = None
         self.last_route: Route | None = None
 

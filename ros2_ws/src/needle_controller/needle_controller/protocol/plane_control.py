@@ -19,11 +19,10 @@ from needle_controller.model.reachability import least_insertion, least_insertio
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate, Estimator
-from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.obstacles import Obstacles
 from needle_controller.presets.path_steering import (
     PathSteering,
     Route,
-    configured_obstacles,
     path_planner,
 )
 from needle_controller.presets.point_steering import PointSteering, point_law
@@ -38,7 +37,7 @@ LARGEST_START_ROLL = math.radians(80.0)
 HEADING_CORRELATION = 0.01
 """Inserted length over which measured headings count as one, because errors of the sensor's
 alignment and registration repeat [m]: harmless up to 10 mrad (60 needles each)."""
-_FAR_AWAY = Obstacles([Obstacle((0.5, 0.0, 0.01), (0.5, 0.0, 0.02), 0.001)])
+_FAR_AWAY = Obstacles(np.array([[0.5, 0.0, 0.01, 0.5, 0.0, 0.02, 0.001]]))
 
 
 class Reachability(NamedTuple):
@@ -105,7 +104,7 @@ class PlaneControl:
         self._plane = settings.plane()
         self._points: PointSteering | None = None
         self.target_point = _configured_point(settings)
-        self.obstacles = configured_obstacles(settings)
+        self.obstacles = Obstacles(np.reshape(settings.obstacles, (-1, 7)))
         self._path = PathSteering(settings)
         self._estimator, self._law = _new_controller(settings, self._plane)
         self._joints: JointSample | None = None
@@ -172,7 +171,7 @@ class PlaneControl:
         if not settings.steers_to_points:
             self.target_point = None
         if settings.obstacles != self._settings.obstacles:
-            self.obstacles = configured_obstacles(settings)
+            self.obstacles = Obstacles(np.reshape(settings.obstacles, (-1, 7)))
         self._path = PathSteering(settings)
         self._settings = settings
         self._restart_point_steering()

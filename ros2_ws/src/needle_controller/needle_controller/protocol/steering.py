@@ -314,8 +314,8 @@ class Steering:
         update, actions = self._update_control(accepted)
         if update is None:
             return actions
-        stamp, joints, slowly = accepted.tip.stamp_ns, accepted.joints, self.confidence.is_doubtful
-        self._ready_step = next_step(stamp, joints, update.command, self.settings, slowly=slowly)
+        joints, slowly = accepted.joints, self.confidence.is_doubtful
+        self._ready_step = next_step(joints, update.command, self.settings, slowly=slowly)
         if self._ready_step is None:
             return actions + self._finish(update, joints)
         return actions + self._send()

@@ -17,7 +17,7 @@ from needle_controller.planning.path_planner import entry_state
 from needle_controller.presets.own_controllers import OwnLaw, checked_estimator, checked_law
 from needle_controller.presets.own_parts import GROUPS, OwnPartError
 from needle_controller.presets.path_steering import OwnPlanner, PathSteering, checked_planner
-from needle_controller.presets.point_steering import prompt_point_law
+from needle_controller.presets.point_steering import point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_core.errors import UserError
@@ -193,7 +193,7 @@ def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) ->
     own = OwnLaw(checked_law(settings.law), settings).to_point
     # A quarter of a circle of 50 mm radius, and behind.
     for target, left in (((0.05, 0.0, 0.05), 0.05 * np.pi / 2.0), ((0.0, 0.0, -0.02), -0.02)):
-        for to_point in (own, prompt_point_law(settings)):
+        for to_point in (own, point_law(settings, is_prompt=True)):
             assert to_point(estimate, target).insertion_left == pytest.approx(left)
 
 

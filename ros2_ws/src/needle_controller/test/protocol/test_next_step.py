@@ -36,7 +36,7 @@ def test_a_step_has_its_length_or_ends_at_depth_or_point() -> None:
     ]
     for insertion, left, end in rows:
         command = SteeringCommand(0.0, 100.0, left)
-        step = next_step(7, JointSample(7, insertion, 1.0), command, SETTINGS, slowly=True)
+        step = next_step(JointSample(7, insertion, 1.0), command, SETTINGS, slowly=True)
         if end is None:
             assert step is None, (insertion, left)
             continue

@@ -73,7 +73,7 @@ class Needle:
             self.least_clearance = min(self.least_clearance, clearance)
             update = self.control.update(self.tip + self.rng.uniform(-NOISE, NOISE, 3), joints)
             self.reachable.append(update.reach.reachable)
-            step = next_step(k, joints, update.command, self.settings, slowly=False)
+            step = next_step(joints, update.command, self.settings, slowly=False)
             self.blocked = update.blocked
             if step is None or update.blocked:
                 break
