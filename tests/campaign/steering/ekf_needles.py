@@ -15,8 +15,7 @@ import numpy.typing as npt
 from scipy.stats import norm
 
 from needle_controller.filter.records import ESTIMATE, TORSION
-from needle_controller.laws.flip_plan import bend_sign
-from needle_controller.laws.roll_law import RollLawSettings, roll_turn
+from needle_controller.laws.roll_law import RollLawSettings, bend_sign, roll_turn
 from needle_controller.observers.luenberger import INITIAL_ROLL_STD
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.compiled import compiled

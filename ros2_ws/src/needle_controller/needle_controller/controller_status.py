@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-from typing import NamedTuple
 
 from needle_controller.protocol.actions import SteeringState
 from needle_controller.protocol.steering import Steering
@@ -63,14 +62,7 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-class ReceivedMessage(NamedTuple):
-    """Topic of a received message, and the time at which its sender sent it [ns]."""
-
-    topic: str
-    sent_ns: int
-
-
-def received_messages(text: str) -> list[ReceivedMessage]:
-    """Return the messages of a log, such as `joint_states 1700000000, needle/tip 5`."""
+def received_messages(text: str) -> list[tuple[str, int]]:
+    """Return topic and time of sending [ns] of each message of a log, such as `tip 5, joints 7`."""
     found = map(_LOGGED.fullmatch, text.split(", "))
-    return [ReceivedMessage(match[1], int(match[2])) for match in found if match is not None]
+    return [(match[1], int(match[2])) for match in found if match is not None]

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from needle_bringup.studies.study_estimators import PoseEstimators
-from needle_controller.laws.flip_plan import bend_sign
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.laws.point_turns import PointLawSettings
-from needle_controller.laws.roll_law import RollLawSettings
+from needle_controller.laws.roll_law import RollLawSettings, bend_sign
 from needle_controller.many_needles import ManyFilters
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import offset_plane

@@ -25,13 +25,11 @@ from needle_controller.laws.point_turns import (
     write_lateral_offset,
 )
 from needle_controller.laws.roll_law import allowed_turn, base_turn, hypotheses_of
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import ROLL
 from needle_controller.observers.estimator import Estimate
 from needle_core.compiled import compiled
-
-Records = npt.NDArray[np.void]
 
 
 class PointLaw:

@@ -6,28 +6,32 @@ curvature; near it, it is proportional to the distance. The desired s3 brings th
 the tip takes the shorter turn to one of the two rolls that have this s3. Each torsion determines
 the rotation of the base that turns the tip through play and lag; the mean over all torsions is
 used.
+
+Within the plane, the needle bends to the side given by the sign of cos(roll). Turning the bevel
+over at planned depths makes it follow a path of arcs (Reed et al., Integrated planning and
+image-guided control for planar needle steering, BioRob 2008), while the law keeps it in the plane.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from needle_controller.filter.records import ESTIMATE, TORSION
 from needle_controller.laws.law import SteeringCommand
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_controller.model.kinematics import PITCH, ROLL, X
 from needle_controller.observers.estimator import Estimate, Hypotheses
 from needle_core.compiled import compiled
-
-Records = npt.NDArray[np.void]
+from needle_core.errors import OutOfBoundsError, UserError
 
 _SMALLEST_LAG = 1e-6
 _USUAL_LAG = 0.008
 _USUAL_PLAY = math.radians(40.0)
+_DEPTH_TOLERANCE = 1e-6
 
 
 class RollLawSettings(NamedTuple):
@@ -90,6 +94,47 @@ class RollLawSettings(NamedTuple):
     far_dead_band: float = 0.2
     largest_turn: float = 2.0
     smallest_weight: float = 0.02
+
+
+def check_flips(depths: Sequence[float], end: float) -> None:
+    """Check that flips come in increasing order, above 0 and before the end of steering.
+
+    Parameters
+    ----------
+    depths : sequence of float
+        Insertion depths of the flips [m].
+    end : float
+        Insertion at which steering ends [m].
+
+    Raises
+    ------
+    UserError
+        Depths that are not above 0 or not increasing, or a flip at the end or beyond.
+    """
+    before = 0.0
+    for number, depth in enumerate(depths, start=1):
+        if depth <= before:
+            bound = f"> {before:g} m" + (", the flip before it" if number > 1 else "")
+            raise UserError(f"flip {number} at {depth:g} m, expected {bound}")
+        before = depth
+    if depths and not before < end:
+        raise OutOfBoundsError(f"flip {len(depths)}", before, 0.0, end, "m")
+
+
+def bend_sign(depths: Sequence[float], insertion: float) -> float:
+    """Return the desired sign of cos(roll), +1 or -1, at an insertion; 0 without flips.
+
+    Parameters
+    ----------
+    depths : sequence of float
+        Insertion depths of the flips [m].
+    insertion : float
+        Insertion depth [m]; at the depth of a flip, within 1 um, the sign is that after the flip.
+    """
+    if not depths:
+        return 0.0
+    done = sum(depth <= insertion + _DEPTH_TOLERANCE for depth in depths)
+    return 1.0 if done % 2 == 0 else -1.0
 
 
 class RollLaw:

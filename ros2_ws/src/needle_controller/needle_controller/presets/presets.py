@@ -7,9 +7,8 @@ import numpy.typing as npt
 
 from needle_controller.filter.filter_settings import BOUNDED_NOISE, NORMAL_NOISE, FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
-from needle_controller.laws.flip_plan import bend_sign
 from needle_controller.laws.law import LinearizingGains, LinearizingLaw, OpenLoopLaw, StepLaw
-from needle_controller.laws.roll_law import RollLaw, RollLawSettings
+from needle_controller.laws.roll_law import RollLaw, RollLawSettings, bend_sign
 from needle_controller.observers.estimator import Estimator
 from needle_controller.observers.luenberger import LuenbergerObserver, ObserverSettings
 from needle_controller.presets.own_controllers import (

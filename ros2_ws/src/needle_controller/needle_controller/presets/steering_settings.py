@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.laws.flip_plan import check_flips
+from needle_controller.laws.roll_law import check_flips
 from needle_controller.model.arrays import Array
 from needle_controller.model.gains import Gains, design_gains
 from needle_controller.model.reachability import check_plane, check_point
@@ -113,11 +113,7 @@ class SteeringSettings:
     )
     nominal_speed: float = parameter(0.002, "m/s", "Insertion speed at speed scale 1.", 1e-5, 0.05)
     max_rotation_per_length: float = parameter(
-        math.radians(30.0) / 0.001,
-        "rad/m",
-        "Maximum rotation of the base per inserted length.",
-        0.0,
-        1000.0,
+        math.radians(30.0) / 0.001, "rad/m", "Maximum base rotation per inserted length.", 0.0, 1e3
     )
     max_winding: float = parameter(
         6.0 * math.pi,
@@ -153,11 +149,7 @@ class SteeringSettings:
         f"whose heading is that of the pre-bent end. Needs {_HEADING_NEEDS}.",
     )
     result_timeout: float = parameter(
-        10.0,
-        "s",
-        "Time without device/result until FAULT, while the device is at rest (monotonic clock).",
-        0.1,
-        600.0,
+        10.0, "s", "Time at rest without device/result until FAULT (monotonic clock).", 0.1, 600.0
     )
     tip_margin: float = parameter(
         0.004, "m", "Accepted distance of a measured tip from the needle's reach.", 0.0, 0.1
@@ -176,11 +168,7 @@ class SteeringSettings:
         choices=("bounded", "normal"),
     )
     tip_noise_bound: float = parameter(
-        0.001,
-        "m",
-        "Maximum error of a measured tip coordinate if tip_noise is bounded.",
-        1e-6,
-        0.1,
+        0.001, "m", "Maximum error of a measured tip coordinate if tip_noise is bounded.", 1e-6, 0.1
     )
     flip_depths: tuple[float, ...] = parameter(
         (),
@@ -212,11 +200,7 @@ class SteeringSettings:
         0.11, "-", "Limits the estimate to s2^2 + (s3/curvature)^2 <= 1 - this value.", 1e-6, 0.9
     )
     demand_margin: float = parameter(
-        0.26,
-        "-",
-        "Limits the demanded state to s2^2 + (s3/curvature)^2 <= 1 - this value.",
-        1e-6,
-        0.9,
+        0.26, "-", "Limits the demanded state, as saturation_margin the estimate.", 1e-6, 0.9
     )
     entry_angle_std: float = parameter(
         math.radians(8.0),

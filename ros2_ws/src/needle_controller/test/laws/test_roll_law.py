@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from needle_controller.filter.records import TORSION
-from needle_controller.laws.flip_plan import bend_sign, check_flips
-from needle_controller.laws.roll_law import RollLaw, RollLawSettings, base_turn, nearest_turn
+from needle_controller.laws.roll_law import (
+    RollLaw,
+    RollLawSettings,
+    base_turn,
+    bend_sign,
+    check_flips,
+    nearest_turn,
+)
 from needle_controller.observers.estimator import Estimate
 from needle_core.errors import UserError
 
