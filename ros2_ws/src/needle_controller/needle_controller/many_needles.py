@@ -7,19 +7,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 
 from needle_controller.filter.bank import advance_needle, correct_needle, start_needle
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.late_tips import LAST
 from needle_controller.filter.mixture import estimate_from_record, estimate_needle
-from needle_controller.filter.records import ESTIMATE, EVENT, HYPOTHESIS, NEEDLE, TORSION
+from needle_controller.filter.records import Bank
 from needle_controller.laws.law import LinearizingGains, linearizing_rate
 from needle_controller.laws.point_law import point_turn
 from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.laws.roll_law import RollLawSettings, roll_turn
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.observers.estimator import Estimate
 from needle_controller.observers.luenberger import (
@@ -29,8 +28,6 @@ from needle_controller.observers.luenberger import (
     correct_observer,
 )
 from needle_core.compiled import compiled, parallel
-
-Records = npt.NDArray[np.void]
 
 
 class ManyFilters:
@@ -56,44 +53,27 @@ class ManyFilters:
     """
 
     def __init__(self, settings: FilterSettings, count: int, shortest_step: float) -> None:
-        self._settings, self._prior = settings, settings.prior()
-        # An array: parallel loops cannot take a single record.
-        self._assumed = np.array([settings.assumptions()])
-        self.needles = np.zeros(count, NEEDLE)
+        # A step has two advances if the base begins to turn within it.
+        events = 2 * math.ceil(LAST / shortest_step) + 4
+        self._settings, self._bank = settings, settings.bank(count, events)
+        self.needles, self.estimates = self._bank.needles, self._bank.estimates
+        self.torsions = self._bank.torsions
         self.needles["initial_rotation"] = np.eye(3)
         self.needles["has_entry"] = True
-        self._hypotheses = np.empty((count, self._prior.size + 1), HYPOTHESIS)
-        # A step has two advances if the base begins to turn within it.
-        self._events = np.zeros((count, 2 * math.ceil(LAST / shortest_step) + 4), EVENT)
-        self.estimates = np.zeros(count, ESTIMATE)
-        self.torsions = np.zeros((count, len(settings.torsion_hypotheses)), TORSION)
 
     def start(self, tips: Array) -> None:
         """Start at first tips, (N, 3) [m]."""
-        for needle, own, tip in zip(self.needles, self._hypotheses, tips, strict=True):
-            start_needle(needle, own, self._prior, tip, 0.0, 0.0, self._assumed[0])
-        every = zip(self.needles, self._hypotheses, self.estimates, self.torsions, strict=True)
-        for records in every:
-            estimate_needle(*records, self._assumed[0])
+        for n, tip in enumerate(tips):
+            start_needle(self._bank, n, tip, 0.0, 0.0)
+            estimate_needle(self._bank, n)
 
     def advance(self, lengths: Array, turns: Array) -> None:
         """Advance by inserted lengths [m] and rotations of the bases [rad], (N,)."""
-        _advance_all(self.needles, self._hypotheses, self._events, lengths, turns, self._assumed)
+        _advance_all(self._bank, lengths, turns)
 
     def correct(self, tips: Array, covariance: Array | None, ages: Array) -> None:
         """Correct by tips, (N, 3), with their covariance, (3, 3), and ages, (N,)."""
-        _correct_all(
-            self.needles,
-            self._hypotheses,
-            self._events,
-            self._prior,
-            tips,
-            self._settings.tip_covariance(covariance),
-            ages,
-            self._assumed,
-            self.estimates,
-            self.torsions,
-        )
+        _correct_all(self._bank, tips, self._settings.tip_covariance(covariance), ages)
 
     def each(self) -> list[Estimate]:
         """Return the estimates as `Estimate`."""
@@ -145,35 +125,19 @@ class ManyObservers:
 
 
 @parallel
-def _advance_all(
-    needles: Records,
-    hypotheses: Records,
-    events: Records,
-    lengths: Array,
-    turns: Array,
-    assumed: Records,
-) -> None:
-    for n in prange(needles.size):
-        advance_needle(needles[n], hypotheses[n], events[n], lengths[n], turns[n], assumed[0])
+def _advance_all(bank: Bank, lengths: Array, turns: Array) -> None:
+    for k in prange(bank.needles.size):
+        # A signed integer, as in the node: compiled once.
+        n = np.int64(k)
+        advance_needle(bank, n, lengths[n], turns[n])
 
 
 @parallel
-def _correct_all(
-    needles: Records,
-    hypotheses: Records,
-    events: Records,
-    prior: Records,
-    tips: Array,
-    covariance: Array,
-    ages: Array,
-    assumed: Records,
-    estimates: Records,
-    torsions: Records,
-) -> None:
-    for n in prange(needles.size):
-        needle, own = needles[n], hypotheses[n]
-        correct_needle(needle, own, events[n], prior, tips[n], covariance, ages[n], assumed[0])
-        estimate_needle(needle, own, estimates[n], torsions[n], assumed[0])
+def _correct_all(bank: Bank, tips: Array, covariance: Array, ages: Array) -> None:
+    for k in prange(bank.needles.size):
+        n = np.int64(k)
+        correct_needle(bank, n, tips[n], covariance, ages[n])
+        estimate_needle(bank, n)
 
 
 @compiled

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from needle_controller.filter.bank import advance_needle, correct_needle, start_needle
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.mixture import estimate_from_record, estimate_needle
-from needle_controller.filter.records import ERROR, ESTIMATE, EVENT, HYPOTHESIS, NEEDLE, TORSION
+from needle_controller.filter.records import ERROR
 from needle_controller.observers.estimator import Estimate
 
 AMBIGUOUS_WEIGHT = 0.1
@@ -52,35 +52,24 @@ class HypothesisFilter:
         initial_rotation: npt.ArrayLike | None = None,
         entry: npt.ArrayLike | None = None,
     ) -> None:
-        self.settings = settings
-        self._prior, self._assumed = settings.prior(), settings.assumptions()
-        self.needle = np.zeros(1, NEEDLE)[0]
+        self.settings, self._bank = settings, settings.bank(1, _EVENTS)
+        self.needle = self._bank.needles[0]
         self.needle["initial_rotation"] = (
             np.eye(3) if initial_rotation is None else initial_rotation
         )
         if entry is not None:
             self.needle["has_entry"], self.needle["entry"] = True, entry
-        self._hypotheses = np.zeros(self._prior.size + 1, HYPOTHESIS)
-        self._events = np.zeros(_EVENTS, EVENT)
         self.reset(np.zeros(3), np.zeros(2))
 
     @property
     def hypotheses(self) -> npt.NDArray[np.void]:
         """View of the present hypotheses, shape (H,), `records.HYPOTHESIS`."""
-        return self._hypotheses[: self.needle["count"]]
+        return self._bank.hypotheses[0, : self.needle["count"]]
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start at a first measurement (NaN: position unknown); see `Estimator.reset`."""
         insertion, turn = np.asarray(joints, dtype=float).tolist()
-        start_needle(
-            self.needle,
-            self._hypotheses,
-            self._prior,
-            np.array(tip, dtype=float),
-            insertion,
-            turn,
-            self._assumed,
-        )
+        start_needle(self._bank, 0, np.array(tip, dtype=float), insertion, turn)
 
     def advance(self, d_insertion: float, d_rotation: float) -> None:
         """Advance by the actual motion; see `Estimator.advance`."""
@@ -89,7 +78,7 @@ class HypothesisFilter:
             raise ValueError(f"d_insertion = {length!r} m, expected finite and >= 0")
         if not np.isfinite(turn):
             raise ValueError(f"d_rotation = {turn!r} rad, expected finite")
-        advance_needle(self.needle, self._hypotheses, self._events, length, turn, self._assumed)
+        advance_needle(self._bank, 0, length, turn)
 
     def correct(
         self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
@@ -100,16 +89,8 @@ class HypothesisFilter:
         Gaussian; in both cases it includes `model_error`. A tip older than the last one is dropped
         with a warning.
         """
-        correct_needle(
-            self.needle,
-            self._hypotheses,
-            self._events,
-            self._prior,
-            np.array(tip, dtype=float),
-            self.settings.tip_covariance(covariance),
-            float(age),
-            self._assumed,
-        )
+        noise = self.settings.tip_covariance(covariance)
+        correct_needle(self._bank, 0, np.array(tip, dtype=float), noise, float(age))
 
     def correct_heading(self, direction: npt.ArrayLike, variance: float) -> None:
         """Use a measured heading in the next `correct`.
@@ -125,10 +106,9 @@ class HypothesisFilter:
 
     def estimate(self) -> Estimate:
         """Return the present estimate; see `Estimator.estimate`."""
-        record = np.zeros(1, ESTIMATE)[0]
-        torsions = np.zeros(len(self.settings.torsion_hypotheses), TORSION)
-        estimate_needle(self.needle, self._hypotheses, record, torsions, self._assumed)
-        return estimate_from_record(record, torsions, self._warnings(record))
+        estimate_needle(self._bank, 0)
+        mean, torsions = self._bank.estimates[0].copy(), self._bank.torsions[0].copy()
+        return estimate_from_record(mean, torsions, self._warnings(mean))
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
         """Transform everything into another target plane; see `Estimator.change_frame`."""
@@ -144,13 +124,13 @@ class HypothesisFilter:
         turns = np.eye(ERROR)
         turns[:3, :3] = turns[3:6, 3:6] = turn
         h["covariance"] = turns @ h["covariance"] @ turns.T
-        events = self._events[: max(needle["events"], 0)]
+        events = self._bank.events[0, : max(needle["events"], 0)]
         events["tip"] = events["tip"] @ turn.T + shift
         events["covariance"] = turn @ events["covariance"] @ turn.T
         events["heading"][:, :3] = events["heading"][:, :3] @ turn.T
 
     def _warnings(self, mean: np.void) -> tuple[str, ...]:
-        needle, assumed, ambiguous = self.needle, self._assumed, mean["ambiguous"]
+        needle, assumed, ambiguous = self.needle, self._bank.assumed[0], mean["ambiguous"]
         margin = _AT_LIMIT * assumed["curvature"]
         low, high = assumed["smallest_curvature"] + margin, assumed["largest_curvature"] - margin
         warnings = {

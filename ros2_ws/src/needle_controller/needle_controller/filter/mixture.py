@@ -6,18 +6,15 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from needle_controller.filter.bank import predicted_hypotheses
 from needle_controller.filter.filter_settings import CORRELATED, NORMAL
-from needle_controller.filter.records import E_TURN, NEAR, NOISES
+from needle_controller.filter.records import E_TURN, NEAR, NOISES, Bank
 from needle_controller.filter.tip_update import SMALLEST_VARIANCE
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_controller.model.kinematics import angle_axes
 from needle_controller.observers.estimator import Estimate, Hypotheses
 from needle_core.compiled import compiled
-
-Records = npt.NDArray[np.void]
 
 HIDDEN_SHARE = 0.5
 """Assumed systematic part of a claimed variance that the tips do not reveal."""
@@ -26,33 +23,23 @@ _NO_MEAN_ROLL = 0.1
 
 
 @compiled
-def estimate_needle(
-    needle: Any, hypotheses: Records, estimate: Any, torsions: Records, assumed: Any
-) -> None:
-    """Compute the estimate of a needle.
+def estimate_needle(bank: Bank, n: int) -> None:
+    """Compute the estimate of needle n.
 
-    Parameters
-    ----------
-    needle, hypotheses : NEEDLE, ndarray of HYPOTHESIS
-        See `bank.start_needle`.
-    estimate : ESTIMATE, changed
-        Position and heading are weighted means; the roll is the mean direction of the tip's x axis
-        about the heading, or that of the likeliest hypothesis if the directions cancel.
-    torsions : ndarray of TORSION, shape (K,), changed
-        Mean over the hypotheses of each torsion.
-    assumed : ASSUMPTIONS
-        As for `bank.advance_needle`.
+    Position and heading are weighted means; the roll is the mean direction of the tip's x axis
+    about the heading, or that of the likeliest hypothesis if the directions cancel.
     """
-    every = predicted_hypotheses(needle, hypotheses, assumed)
+    needle, estimate, assumed = bank.needles[n], bank.estimates[n], bank.assumed[0]
+    every = predicted_hypotheses(needle, bank.hypotheses[n], assumed)
     whole, best = 0.0, 0
-    for n in range(needle.count):
-        whole += every[n].weight
-        if every[n].weight > every[best].weight:
-            best = n
+    for m in range(needle.count):
+        whole += every[m].weight
+        if every[m].weight > every[best].weight:
+            best = m
     position, heading, side = np.zeros(3), np.zeros(3), np.zeros(3)
     bend = curvature = scale = xx = x_pitch = pitch_pitch = ambiguous = miss = 0.0
-    for n in range(needle.count):
-        h = every[n]
+    for m in range(needle.count):
+        h = every[m]
         w, r, p = h.weight / whole, h.rotation, h.covariance
         along = 0.0
         for k in range(3):
@@ -96,7 +83,7 @@ def estimate_needle(
         estimate.base += needle.pending_turn[k]
     estimate.wound = estimate.base + needle.start_turn
     estimate.miss = miss
-    _average_torsions(every, whole, torsions)
+    _average_torsions(every, whole, bank.torsions[n])
     _write_covariance(needle, every, whole, estimate, assumed)
 
 
