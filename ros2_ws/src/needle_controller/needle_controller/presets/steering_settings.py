@@ -58,12 +58,8 @@ class SteeringSettings:
     planner: str = fixed_parameter(
         "", "-", "Planner of paths to a point, likewise (group needle_controller.planners)."
     )
-    seed: int = fixed_parameter(
-        0, "-", "Seed of an estimator of another package; presets use none.", 0, 2**31 - 1
-    )
-    curvature: float = parameter(
-        1.0 / 0.122, "1/m", "Curvature of the needle's path in the tissue.", 0.1, 100.0
-    )
+    seed: int = fixed_parameter(0, "-", "Seed of another package's estimator.", 0, 2**31 - 1)
+    curvature: float = parameter(1 / 0.122, "1/m", "Curvature of the needle's path.", 0.1, 100.0)
     needle_diameter: float = fixed_parameter(
         0.0007, "m", "Diameter of the needle, for the distance to obstacles.", 0.2e-3, 3e-3
     )

@@ -149,19 +149,18 @@ class RetractionMonitor:
         self._retracted = False
         self._deepest = 0.0
         self._recent: deque[float] = deque(maxlen=_MEDIAN_OF)
-        self._before: JointSample | None = None
-        self._after: JointSample | None = None
+        self._jump: tuple[JointSample, JointSample] | None = None
 
     @property
     def reason(self) -> str:
         """Reason to withdraw the needle before it is steered; empty if there is none."""
         if self._retracted:
             return "the needle was retracted: withdraw it first"
-        if self._before is not None and self._after is not None:
+        if self._jump is not None:
+            before, after = self._jump
             return (
-                f"joint_states jumped from {self._before.insertion:.4g} m, "
-                f"{self._before.rotation:.4g} rad to {self._after.insertion:.4g} m, "
-                f"{self._after.rotation:.4g} rad: withdraw the needle first"
+                f"joint_states jumped from {before.insertion:.4g} m, {before.rotation:.4g} rad to "
+                f"{after.insertion:.4g} m, {after.rotation:.4g} rad: withdraw the needle first"
             )
         return ""
 
@@ -170,7 +169,7 @@ class RetractionMonitor:
         self._deepest = insertion
         self._retracted = False
         self._recent.clear()
-        self._before = self._after = None
+        self._jump = None
 
     def update(self, insertion: float, *, out_below: float, tolerance: float) -> bool:
         """Add a sample; return whether the needle is being retracted.
@@ -189,7 +188,7 @@ class RetractionMonitor:
             return False
         here = statistics.median_low(self._recent)
         is_out = here <= out_below
-        if self._before is not None:
+        if self._jump is not None:
             if is_out:
                 self.reset(here)
             return False
@@ -216,9 +215,9 @@ class RetractionMonitor:
             Whether the joints are away from their last observed position.
         """
         self._recent.clear()
-        observed = self._before or before
+        observed = self._jump[0] if self._jump else before
         away = not after.is_near(observed, tolerance, _SAME_ROTATION)
-        self._before, self._after = (observed, after) if away else (None, None)
+        self._jump = (observed, after) if away else None
         return away
 
 
