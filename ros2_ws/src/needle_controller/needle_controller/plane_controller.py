@@ -42,9 +42,9 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
-from needle_core.messages import quaternion_from_rotation
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
+Handler = Callable[[Any, Moment], Iterable[Action]]
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
 PROPOSED_TARGET, PLANNED_PATH = "needle/proposed_target", "needle/planned_path"
@@ -90,8 +90,7 @@ class PlaneController(Component):
         self._logged: dict[str, float] = {}
         self._reported_health: tuple[dict[str, str], dict[str, str]] | None = None
         self._published: ControllerStatus | None = None
-        rows: tuple[tuple[str, type[Any], Callable[[Any, Moment], Iterable[Action]], Delivery], ...]
-        rows = (
+        rows: tuple[tuple[str, type[Any], Handler, Delivery], ...] = (
             ("joint_states", m.JointState, self._on_joints, JOINT_STATES),
             ("device/status", DeviceStatus, self._on_device, LATCHED),
             ("device/result", m.CommandResult, self._on_result, RELIABLE),
@@ -147,13 +146,7 @@ class PlaneController(Component):
         self._has_driver = any(name.rpartition("/")[2] not in _NO_DRIVERS for name in names)
         return ()
 
-    def _receive(
-        self,
-        topic: str,
-        handler: Callable[[Any, Moment], Iterable[Action]],
-        message: Any,
-        at: Moment,
-    ) -> Actions:
+    def _receive(self, topic: str, handler: Handler, message: Any, at: Moment) -> Actions:
         self._received.append(f"{topic} {at.sent_ns}")
         try:
             actions = handler(message, at)
@@ -231,17 +224,12 @@ class PlaneController(Component):
         return reply, self.carry_out(actions, at)
 
     def _on_start(self, _: bool | None, number: int, at: Moment) -> Actions:
-        if not self._has_driver:
-            yield Reply(number, False, f"waiting for subscriber of {COMMANDS}")
-            return
-        reply, actions = self.start(at)
-        yield from actions
-        yield Reply(number, reply.success, reply.message)
+        if self._has_driver:
+            return _answer(number, *self.start(at))
+        return [Reply(number, False, f"waiting for subscriber of {COMMANDS}")]
 
     def _on_stop_request(self, _: bool | None, number: int, at: Moment) -> Actions:
-        reply, actions = self.stop(at)
-        yield from actions
-        yield Reply(number, reply.success, reply.message)
+        return _answer(number, *self.stop(at))
 
     def _on_accept(self, _: bool | None, number: int, at: Moment) -> Actions:
         """Publish the proposal as the target point, so that a bag records it."""
@@ -285,6 +273,11 @@ class PlaneController(Component):
             self._received.clear()
             yield Diagnose("steering", status.diagnostic)
             yield Publish(STATUS, dataclasses.replace(status, heard=received))
+
+
+def _answer(number: int, reply: StartReply, actions: Actions) -> Actions:
+    yield from actions
+    yield Reply(number, reply.success, reply.message)
 
 
 def trajectory(command: SendStep | SendPath) -> m.Trajectory:
@@ -341,7 +334,7 @@ def _pose(estimate: Estimate, stamp_ns: int) -> m.PoseWithCovariance:
         stamp_ns,
         TARGET_PLANE,
         (x, y, z),
-        quaternion_from_rotation(estimate.rotation.tolist()),
+        m.quaternion_from_rotation(estimate.rotation.tolist()),
         tuple(covariance.ravel().tolist()),
     )
 

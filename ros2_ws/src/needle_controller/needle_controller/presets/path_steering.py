@@ -129,9 +129,8 @@ class PathSteering:
     def __init__(self, settings: SteeringSettings) -> None:
         self._settings = settings
         self._planner = path_planner(settings)
-        self._own = None
-        if settings.planner:
-            self._own = OwnPlanner(checked_planner(settings.planner), settings)
+        name = settings.planner
+        self._own = OwnPlanner(checked_planner(name), settings) if name else None
         self._law = point_law(settings, is_prompt=True)
         self.path: NeedlePath | None = None
         self.last_route: Route | None = None

@@ -41,9 +41,6 @@ from needle_core.component import Log
 from needle_core.messages import Point
 from needle_core.status_messages import DeviceStatus
 
-_STOPPED_DEVICE = ("FAULT", "ESTOPPED")
-_DISABLED_DEVICE = ("UNCONFIGURED", "DISABLED")
-
 
 class Steering:
     """The step protocol of one needle.
@@ -190,10 +187,10 @@ class Steering:
         actions = self.watchdog.on_device_message()
         if not self._steering:
             return actions
-        if status.state in _STOPPED_DEVICE:
+        if status.state in {"FAULT", "ESTOPPED"}:
             why = f"device is {status.state}: {status.why}"
             return actions + self._leave(SteeringState.FAULT, why, "error")
-        if status.state in _DISABLED_DEVICE:
+        if status.state in {"UNCONFIGURED", "DISABLED"}:
             return actions + self._leave(SteeringState.IDLE, f"device is {status.state}", "warning")
         if self.awaiting is Awaiting.HOLD and status.hold_owner:
             actions += self._await_tip()
