@@ -176,10 +176,10 @@ def read_bag(path: Path) -> InsertionRecord:
                         joints.setdefault(at.stamp_ns, (at.insertion, at.rotation))
                     continue
                 tip = from_ros(Point, message)
-                point = point_from_message("a tip", tip.frame_id, tip.position)
+                point = point_from_message(f"{path}: a tip", tip.frame_id, tip.position)
                 tips.setdefault(tip.stamp_ns, point)
-            except (AttributeError, UserError) as error:
-                raise UserError(f"{path}: {sent.topic}: {error}") from error
+            except AttributeError as error:
+                raise UserError(f"{path}: {sent.topic} has an unexpected type: {error}") from error
     for topic, found in (("needle/tip", tips), ("joint_states", joints)):
         if not found:
             raise UserError(f"{path}: the bag has no messages on {topic}")
