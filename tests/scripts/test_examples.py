@@ -23,7 +23,7 @@ from needle_bringup.simulation.rig_configuration import (
 )
 from needle_bringup.simulation.simulate_options import parse
 from needle_controller.observers.estimator import Estimate, pose_estimate
-from needle_controller.planning.entry import entry_state
+from needle_controller.planning.path_planner import entry_state
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_core.settings.parameter_files import read_parameters
 from needle_sim.needle.plant import NeedlePlant, initial_pose

@@ -14,7 +14,6 @@ from campaign.benchmarks import reference_loop
 from campaign.benchmarks.figure_rows import Row
 from needle_bringup.studies.study_controllers import controller_factory, needles_at_a_time
 from needle_controller.model.gains import sampled_observer_gain
-from needle_controller.model.reachability import reachability
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
@@ -167,7 +166,6 @@ def _update_all(preset: str, taken: Sequence[tuple[FloatArray, JointSample]]) ->
     for tip, joints in taken:
         estimate = control.update(tip, joints).estimate
         estimate.covariance  # noqa: B018 - lazy, and published
-        reachability(estimate.reduced, estimate.curvature, insertion=joints.insertion, end=0.12)
 
 
 def _least_time(work: Callable[[], object], times: int) -> float:

@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import norm
 
-from needle_controller.filter.records import TORSION
-from needle_controller.laws.flip_plan import FlipPlan
-from needle_controller.laws.roll_law import RollLawSettings, roll_turn
+from needle_controller.filter.records import ESTIMATE, TORSION
+from needle_controller.laws.roll_law import RollLawSettings, bend_sign, roll_turn
 from needle_controller.observers.luenberger import INITIAL_ROLL_STD
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.compiled import compiled
@@ -60,7 +59,7 @@ class EkfNeedles:
     ) -> None:
         known = SteeringSettings(step_length=step_length, flip_depths=flip_depths, depth=1.0)
         self._law = RollLawSettings(**known.turning)
-        self._plan = FlipPlan(flip_depths)
+        self._flips = flip_depths
         angles = (known.entry_angle_std, known.entry_angle_std, INITIAL_ROLL_STD)
         spread = [tip_std] * 3 + [*angles, CURVATURE_SPREAD * known.curvature]
         self._prior = np.diag(np.square(spread))
@@ -107,8 +106,9 @@ class EkfNeedles:
 
     def _rates(self) -> FloatArray:
         turns = np.empty(self._needles.size)
-        sign = self._plan.bend_sign(self._insertion)
-        _turn_all(self._needles, np.zeros(1, TORSION), sign, self._law, turns)
+        sign = bend_sign(self._flips, self._insertion)
+        mean, only = np.zeros(1, ESTIMATE)[0], np.zeros(1, TORSION)
+        _turn_all(self._needles, mean, only, sign, self._law, turns)
         return turns / self._law.step_length
 
 
@@ -187,7 +187,12 @@ def _plane_uncertainty(needle: Any) -> FloatArray:
 
 @compiled
 def _turn_all(
-    needles: Records, only: Records, bend_sign: float, law: RollLawSettings, turns: FloatArray
+    needles: Records,
+    mean: Any,
+    only: Records,
+    bend_sign: float,
+    law: RollLawSettings,
+    turns: FloatArray,
 ) -> None:
     for n in range(needles.size):
         needle, t = needles[n], only[0]
@@ -196,6 +201,7 @@ def _turn_all(
         t.curvature = max(needle.curvature, 1.0)
         t.tip_angle = t.behind_play = needle.base
         t.agreement = t.weight = t.gain = 1.0
-        known = _plane_uncertainty(needle)
-        x, sin_pitch, base = needle.position[0], needle.rotation[0, 2], needle.base
-        turns[n] = roll_turn(x, sin_pitch, known, only, base, base, bend_sign, law)[0]
+        mean.linearized[0], mean.linearized[1] = needle.position[0], needle.rotation[0, 2]
+        mean.uncertainty[:] = _plane_uncertainty(needle)
+        mean.base = mean.wound = needle.base
+        turns[n] = roll_turn(mean, only, bend_sign, law)[0]

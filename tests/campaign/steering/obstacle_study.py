@@ -122,7 +122,7 @@ def steer(
         times.append(time.thread_time() - begin)
         step = None
         if update.command is not None and not update.blocked:
-            step = next_step(k, joints, update.command, settings, slowly=False)
+            step = next_step(joints, update.command, settings, slowly=False)
         if step is None:
             miss = float(np.linalg.norm(_tip(plant) - scene.target))
             return dataclasses.replace(solved, taken=True, miss=miss, least=least)

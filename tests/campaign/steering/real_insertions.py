@@ -72,13 +72,13 @@ def compare(tips: Array, truth: Array) -> tuple[float, float, bool]:
     """
     given = tips[tips[:, 2] <= GIVEN]
     fit = fit_checked(given, None, CurvatureFitSettings(repeating_error=2e-5))
-    ahead = forecast_tip(given, fit, AHEAD)
+    tip, interval = forecast_tip(given, fit, AHEAD)
     # The forecast is for a length of path, the truth for a depth.
-    slope = ahead.tip[:2] / ahead.tip[2]
-    off = ahead.tip[:2] + slope * (AHEAD - ahead.tip[2]) - truth
+    slope = tip[:2] / tip[2]
+    off = tip[:2] + slope * (AHEAD - tip[2]) - truth
     parabola = np.polyfit(given[:, 2], given[:, :2], 2)
     plain = parabola[0] * AHEAD**2 + parabola[1] * AHEAD + parabola[2] - truth
-    inside = bool(np.all(np.abs(off) <= ahead.interval()[:2]))
+    inside = bool(np.all(np.abs(off) <= interval[:2]))
     return float(np.linalg.norm(off)), float(np.linalg.norm(plain)), inside
 
 

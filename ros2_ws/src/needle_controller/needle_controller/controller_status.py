@@ -1,4 +1,4 @@
-"""Content of needle/controller_status, including the log of received messages.
+"""Content of needle/controller_status, and its log of received messages (`heard`).
 
 A node on a busy machine receives a message some time after it was sent, possibly after later ones;
 messages that exceed its queue are lost. With the log, a bag can be replayed in the order of
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-from typing import NamedTuple
 
 from needle_controller.protocol.actions import SteeringState
 from needle_controller.protocol.steering import Steering
@@ -17,8 +16,6 @@ from needle_core.diagnostics import Level
 from needle_core.status_messages import ControllerStatus
 
 _LEVELS = {SteeringState.FAULT: Level.ERROR, SteeringState.WAITING_FOR_TIP: Level.WARN}
-_LOG_LENGTH = 100
-"""Largest number of messages in one log: one or two seconds of a rig at rest."""
 _LOGGED = re.compile(r"(\S+) (\d{1,19})")
 
 
@@ -43,8 +40,8 @@ def controller_status(steering: Steering, source: str) -> ControllerStatus:
         target_offset_m=control.plane.offset,
         target_point_m=target,
         obstacles=len(control.obstacles),
-        reachable=None if reach is None else bool(reach.reachable),
-        reachable_depth_m=None if reach is None else float(reach.depth),
+        reachable=None if reach is None else reach.reachable,
+        reachable_depth_m=None if reach is None else reach.depth,
         trusted=confidence.verdict,
         r1_low_m=_finite(confidence.low),
         r1_high_m=_finite(confidence.high),
@@ -65,36 +62,7 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-class ReceivedMessage(NamedTuple):
-    """Topic of a received message, and the time at which its sender sent it [ns]."""
-
-    topic: str
-    sent_ns: int
-
-
-class ReceptionLog:
-    """Messages received since the last published status, in order."""
-
-    def __init__(self) -> None:
-        self._messages: list[ReceivedMessage] = []
-
-    def add(self, topic: str, sent_ns: int) -> None:
-        """Add a received message."""
-        self._messages.append(ReceivedMessage(topic, sent_ns))
-
-    @property
-    def is_full(self) -> bool:
-        """Whether the log must be published."""
-        return len(self._messages) >= _LOG_LENGTH
-
-    def pop_text(self) -> str:
-        """Return the log as text, and clear it."""
-        text = ", ".join(f"{topic} {sent_ns}" for topic, sent_ns in self._messages)
-        self._messages.clear()
-        return text
-
-
-def received_messages(text: str) -> list[ReceivedMessage]:
-    """Return the messages of `ReceptionLog.pop_text`."""
+def received_messages(text: str) -> list[tuple[str, int]]:
+    """Return topic and time of sending [ns] of each message of a log, such as `tip 5, joints 7`."""
     found = map(_LOGGED.fullmatch, text.split(", "))
-    return [ReceivedMessage(match[1], int(match[2])) for match in found if match is not None]
+    return [(match[1], int(match[2])) for match in found if match is not None]

@@ -7,19 +7,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 
 from needle_controller.filter.bank import advance_needle, correct_needle, start_needle
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.late_tips import LAST
 from needle_controller.filter.mixture import estimate_from_record, estimate_needle
-from needle_controller.filter.records import ESTIMATE, EVENT, HYPOTHESIS, NEEDLE, TORSION
+from needle_controller.filter.records import Bank
 from needle_controller.laws.law import LinearizingGains, linearizing_rate
 from needle_controller.laws.point_law import point_turn
 from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.laws.roll_law import RollLawSettings, roll_turn
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.observers.estimator import Estimate
 from needle_controller.observers.luenberger import (
@@ -29,8 +28,6 @@ from needle_controller.observers.luenberger import (
     correct_observer,
 )
 from needle_core.compiled import compiled, parallel
-
-Records = npt.NDArray[np.void]
 
 
 class ManyFilters:
@@ -49,48 +46,34 @@ class ManyFilters:
 
     Attributes
     ----------
+    needles : ndarray of NEEDLE, shape (N,)
+        Their states.
     estimates, torsions : ndarray of ESTIMATE, TORSION, shape (N,), (N, K)
         Present estimates.
     """
 
     def __init__(self, settings: FilterSettings, count: int, shortest_step: float) -> None:
-        self._settings, self._prior = settings, settings.prior()
-        # An array: parallel loops cannot take a single record.
-        self._assumed = np.array([settings.assumptions()])
-        self._needles = np.zeros(count, NEEDLE)
-        self._needles["initial_rotation"] = np.eye(3)
-        self._needles["has_entry"] = True
-        self._hypotheses = np.empty((count, self._prior.size + 1), HYPOTHESIS)
         # A step has two advances if the base begins to turn within it.
-        self._events = np.zeros((count, 2 * math.ceil(LAST / shortest_step) + 4), EVENT)
-        self.estimates = np.zeros(count, ESTIMATE)
-        self.torsions = np.zeros((count, len(settings.torsion_hypotheses)), TORSION)
+        events = 2 * math.ceil(LAST / shortest_step) + 4
+        self._settings, self._bank = settings, settings.bank(count, events)
+        self.needles, self.estimates = self._bank.needles, self._bank.estimates
+        self.torsions = self._bank.torsions
+        self.needles["initial_rotation"] = np.eye(3)
+        self.needles["has_entry"] = True
 
     def start(self, tips: Array) -> None:
         """Start at first tips, (N, 3) [m]."""
-        _start_all(self._needles, self._hypotheses, self._prior, tips, self._assumed)
-        self._estimate()
+        for n, tip in enumerate(tips):
+            start_needle(self._bank, n, tip, 0.0, 0.0)
+            estimate_needle(self._bank, n)
 
     def advance(self, lengths: Array, turns: Array) -> None:
         """Advance by inserted lengths [m] and rotations of the bases [rad], (N,)."""
-        _advance_all(self._needles, self._hypotheses, self._events, lengths, turns, self._assumed)
+        _advance_all(self._bank, lengths, turns)
 
     def correct(self, tips: Array, covariance: Array | None, ages: Array) -> None:
         """Correct by tips, (N, 3), with their covariance, (3, 3), and ages, (N,)."""
-        _correct_all(
-            self._needles,
-            self._hypotheses,
-            self._events,
-            self._prior,
-            tips,
-            self._settings.tip_covariance(covariance),
-            ages,
-            self._assumed,
-        )
-        self._estimate()
-
-    def _estimate(self) -> None:
-        _estimate_all(self._needles, self._hypotheses, self.estimates, self.torsions, self._assumed)
+        _correct_all(self._bank, tips, self._settings.tip_covariance(covariance), ages)
 
     def each(self) -> list[Estimate]:
         """Return the estimates as `Estimate`."""
@@ -102,9 +85,7 @@ class ManyFilters:
     def roll_rates(self, settings: RollLawSettings, bend_sign: float) -> Array:
         """Return each base's rotation rate by the roll law, (N,) [rad/m]."""
         turns = np.empty(self.estimates.size)
-        # Contiguous, as in the node: compiled once.
-        uncertainty = np.ascontiguousarray(self.estimates["uncertainty"])
-        _roll_all(self.estimates, uncertainty, self.torsions, bend_sign, settings, turns)
+        _roll_all(self.estimates, self.torsions, bend_sign, settings, turns)
         return turns / settings.step_length
 
     def point_rates(
@@ -117,101 +98,58 @@ class ManyFilters:
 
 
 class ManyObservers:
-    """Observers of N needles, and the law of [KC09]."""
+    """Observers of N needles, whose bases start at 0, and the law of [KC09]."""
 
-    def __init__(
-        self, settings: ObserverSettings, law: LinearizingGains | None, count: int
-    ) -> None:
-        self._settings, self._law = settings, law
+    def __init__(self, settings: ObserverSettings, count: int) -> None:
+        self._settings = settings
         self._needles = np.zeros(count, OBSERVER)
 
-    def start(self, tips: Array) -> Array:
-        """Start at first tips, (N, 3) [m], the bases at 0; return the rates, (N,) [rad/m]."""
+    def start(self, tips: Array) -> None:
+        """Start at first tips, (N, 3) [m]."""
         self._needles["linearized"][:, 0] = tips[:, 0]
-        return self._rates()
 
-    def step(
-        self, lengths: Array, unturned: Array, turns: Array, tips: Array, ages: Array
-    ) -> Array:
-        """Advance by a step, correct by its tips; return the rotation rates, (N,) [rad/m].
+    def advance(self, lengths: Array, turns: Array) -> None:
+        """Advance by inserted lengths [m] and rotations of the bases [rad], (N,)."""
+        _advance_observers(self._needles, lengths, turns, self._settings)
 
-        Parameters
-        ----------
-        lengths, unturned, turns : ndarray, shape (N,)
-            Inserted length, its part before the base begins to turn [m], and rotation [rad].
-        tips, ages : ndarray, shape (N, 3), (N,)
-            See `ManyFilters.correct`.
-        """
-        _step_observers(self._needles, lengths, unturned, turns, tips, ages, self._settings)
-        return self._rates()
+    def correct(self, tips: Array, _covariance: Array | None, ages: Array) -> None:
+        """Correct by tips, (N, 3), of ages (N,); the constant gain does not use a covariance."""
+        _correct_observers(self._needles, tips, ages, self._settings)
 
-    def _rates(self) -> Array:
+    def rates(self, law: LinearizingGains | None) -> Array:
+        """Return each base's rotation rate by the law of [KC09], (N,) [rad/m]; without one, 0."""
         rates = np.zeros(self._needles.size)
-        if self._law is not None:
-            linearized = np.ascontiguousarray(self._needles["linearized"])
-            _linearizing_all(linearized, self._settings.curvature, self._law, rates)
+        if law is not None:
+            _linearizing_all(self._needles, self._settings.curvature, law, rates)
         return rates
 
 
-@compiled
-def _start_all(
-    needles: Records, hypotheses: Records, prior: Records, tips: Array, assumed: Records
-) -> None:
-    for n in range(needles.size):
-        start_needle(needles[n], hypotheses[n], prior, tips[n], 0.0, 0.0, assumed[0])
+@parallel
+def _advance_all(bank: Bank, lengths: Array, turns: Array) -> None:
+    for k in prange(bank.needles.size):
+        # A signed integer, as in the node: compiled once.
+        n = np.int64(k)
+        advance_needle(bank, n, lengths[n], turns[n])
 
 
 @parallel
-def _advance_all(
-    needles: Records,
-    hypotheses: Records,
-    events: Records,
-    lengths: Array,
-    turns: Array,
-    assumed: Records,
-) -> None:
-    for n in prange(needles.size):
-        advance_needle(needles[n], hypotheses[n], events[n], lengths[n], turns[n], assumed[0])
-
-
-@parallel
-def _correct_all(
-    needles: Records,
-    hypotheses: Records,
-    events: Records,
-    prior: Records,
-    tips: Array,
-    covariance: Array,
-    ages: Array,
-    assumed: Records,
-) -> None:
-    for n in prange(needles.size):
-        needle, own = needles[n], hypotheses[n]
-        correct_needle(needle, own, events[n], prior, tips[n], covariance, ages[n], assumed[0])
-
-
-@parallel
-def _estimate_all(
-    needles: Records, hypotheses: Records, estimates: Records, torsions: Records, assumed: Records
-) -> None:
-    for n in prange(needles.size):
-        estimate_needle(needles[n], hypotheses[n], estimates[n], torsions[n], assumed[0])
+def _correct_all(bank: Bank, tips: Array, covariance: Array, ages: Array) -> None:
+    for k in prange(bank.needles.size):
+        n = np.int64(k)
+        correct_needle(bank, n, tips[n], covariance, ages[n])
+        estimate_needle(bank, n)
 
 
 @compiled
 def _roll_all(
     estimates: Records,
-    uncertainty: Array,
     torsions: Records,
     bend_sign: float,
     settings: RollLawSettings,
     turns: Array,
 ) -> None:
     for n in range(estimates.size):
-        s, base, wound = estimates[n].linearized, estimates[n].base, estimates[n].wound
-        turns[n] = roll_turn(
-            s[0], s[1], uncertainty[n], torsions[n], base, wound, bend_sign, settings
-        )[0]
+        turns[n] = roll_turn(estimates[n], torsions[n], bend_sign, settings)[0]
 
 
 @compiled
@@ -225,37 +163,27 @@ def _point_all(
     left: Array,
 ) -> None:
     for n in range(estimates.size):
-        estimate = estimates[n]
         turns[n], left[n] = point_turn(
-            estimate.coordinates,
-            estimate.curvature,
-            estimate.uncertainty,
-            torsions[n],
-            estimate.base,
-            estimate.wound,
-            targets[n],
-            rotation_left[n],
-            settings,
+            estimates[n], torsions[n], targets[n], rotation_left[n], settings
         )
 
 
 @compiled
-def _step_observers(
-    needles: Records,
-    lengths: Array,
-    unturned: Array,
-    turns: Array,
-    tips: Array,
-    ages: Array,
-    settings: ObserverSettings,
+def _advance_observers(
+    needles: Records, lengths: Array, turns: Array, settings: ObserverSettings
+) -> None:
+    for n in range(needles.size):
+        advance_observer(needles[n], lengths[n], turns[n], settings)
+
+
+@compiled
+def _correct_observers(
+    needles: Records, tips: Array, ages: Array, settings: ObserverSettings
 ) -> None:
     # Most steps have the same length, and so the same gain.
     since, gain = 0.0, (0.0, 0.0, 0.0)
     for n in range(needles.size):
         needle = needles[n]
-        if unturned[n] > 0.0:
-            advance_observer(needle, unturned[n], 0.0, settings)
-        advance_observer(needle, lengths[n] - unturned[n], turns[n], settings)
         if math.isfinite(tips[n, 0] + tips[n, 1] + tips[n, 2]):
             if needle.since_correction != since:
                 since = needle.since_correction
@@ -265,10 +193,10 @@ def _step_observers(
 
 @compiled
 def _linearizing_all(
-    linearized: Array, curvature: float, law: LinearizingGains, rates: Array
+    needles: Records, curvature: float, law: LinearizingGains, rates: Array
 ) -> None:
     for n in range(rates.size):
-        s = linearized[n]
+        s = needles[n].linearized
         # Roll of s, the inverse of (6)
         sine = s[2] / curvature
         roll = math.atan2(sine, math.sqrt(1.0 - s[1] * s[1] - sine * sine))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from needle_controller.controller_status import ReceptionLog, controller_status
+from needle_controller.controller_status import controller_status
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes, rotation_from_quaternion
 from needle_controller.model.target_plane import RIG, plane_from_pose, point_from_message
@@ -19,9 +18,9 @@ from needle_controller.planning.obstacles import obstacles_from_markers
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import Action, PublishUpdate, SendPath, SendStep, StartReply
 from needle_controller.protocol.continuous import make_steering
-from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.joint_history import joint_sample
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.tip_checks import Heading, TipCovariance, TipMeasurement
+from needle_controller.protocol.tip_checks import Heading, TipCovariance
 from needle_core import messages as m
 from needle_core.component import (
     JOINT_STATES,
@@ -43,9 +42,9 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
-from needle_core.messages import quaternion_from_rotation
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
+Handler = Callable[[Any, Moment], Iterable[Action]]
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
 PROPOSED_TARGET, PLANNED_PATH = "needle/proposed_target", "needle/planned_path"
@@ -54,6 +53,8 @@ _TARGETS = (TARGET_PLANE, TARGET_POINT, OBSTACLES)
 _CHECKED = ("joint_states", *_TARGETS, PROPOSED_TARGET)
 _LOG_PERIOD = 2.0
 """Shortest time between two log messages of one kind [s]."""
+_MOST_RECEIVED = 100
+"""Number of received messages that are published at once: one or two seconds of a rig at rest."""
 _UNKNOWN_HEADING = 0.25
 """Variance of a heading above which it counts as not measured [rad^2]."""
 
@@ -85,12 +86,11 @@ class PlaneController(Component):
         self._proposal: m.Point | None = None
         self._bad_joints = 0
         self._has_driver = False
-        self._received = ReceptionLog()
+        self._received: list[str] = []
         self._logged: dict[str, float] = {}
         self._reported_health: tuple[dict[str, str], dict[str, str]] | None = None
         self._published: ControllerStatus | None = None
-        rows: tuple[tuple[str, type[Any], Callable[[Any, Moment], Iterable[Action]], Delivery], ...]
-        rows = (
+        rows: tuple[tuple[str, type[Any], Handler, Delivery], ...] = (
             ("joint_states", m.JointState, self._on_joints, JOINT_STATES),
             ("device/status", DeviceStatus, self._on_device, LATCHED),
             ("device/result", m.CommandResult, self._on_result, RELIABLE),
@@ -146,14 +146,8 @@ class PlaneController(Component):
         self._has_driver = any(name.rpartition("/")[2] not in _NO_DRIVERS for name in names)
         return ()
 
-    def _receive(
-        self,
-        topic: str,
-        handler: Callable[[Any, Moment], Iterable[Action]],
-        message: Any,
-        at: Moment,
-    ) -> Actions:
-        self._received.add(topic, at.sent_ns)
+    def _receive(self, topic: str, handler: Handler, message: Any, at: Moment) -> Actions:
+        self._received.append(f"{topic} {at.sent_ns}")
         try:
             actions = handler(message, at)
         except UserError as error:
@@ -178,8 +172,7 @@ class PlaneController(Component):
         return self.steering.on_result(message.stamp_ns, message.outcome, at.sent_ns)
 
     def _on_tip(self, message: m.Point, at: Moment) -> Iterable[Action]:
-        position = np.array(message.position)
-        return self.steering.on_tip(TipMeasurement(message.stamp_ns, message.frame_id, position))
+        return self.steering.on_tip(message)
 
     def _on_tip_pose(self, message: m.PoseWithCovariance, at: Moment) -> Iterable[Action]:
         heading = measured_heading(message) if self.settings.measured_heading else None
@@ -212,7 +205,7 @@ class PlaneController(Component):
         return [Log("info", text, PROPOSED_TARGET)]
 
     def _checked_point(self, message: m.Point) -> Array:
-        point = point_from_message(message.frame_id, message.position)
+        point = point_from_message(TARGET_POINT, message.frame_id, message.position)
         self.steering.settings.check_point(point)
         return point
 
@@ -231,17 +224,12 @@ class PlaneController(Component):
         return reply, self.carry_out(actions, at)
 
     def _on_start(self, _: bool | None, number: int, at: Moment) -> Actions:
-        if not self._has_driver:
-            yield Reply(number, False, f"waiting for subscriber of {COMMANDS}")
-            return
-        reply, actions = self.start(at)
-        yield from actions
-        yield Reply(number, reply.success, reply.message)
+        if self._has_driver:
+            return _answer(number, *self.start(at))
+        return [Reply(number, False, f"waiting for subscriber of {COMMANDS}")]
 
     def _on_stop_request(self, _: bool | None, number: int, at: Moment) -> Actions:
-        reply, actions = self.stop(at)
-        yield from actions
-        yield Reply(number, reply.success, reply.message)
+        return _answer(number, *self.stop(at))
 
     def _on_accept(self, _: bool | None, number: int, at: Moment) -> Actions:
         """Publish the proposal as the target point, so that a bag records it."""
@@ -280,34 +268,22 @@ class PlaneController(Component):
                 values = counts if topic == "joint_states" else {}
                 yield Diagnose(topic, _health(problems.get(topic, ""), values))
         status = controller_status(self.steering, self.name)
-        if status != self._published or self._received.is_full:
-            self._published = status
+        if status != self._published or len(self._received) >= _MOST_RECEIVED:
+            self._published, received = status, ", ".join(self._received)
+            self._received.clear()
             yield Diagnose("steering", status.diagnostic)
-            yield Publish(STATUS, dataclasses.replace(status, heard=self._received.pop_text()))
+            yield Publish(STATUS, dataclasses.replace(status, heard=received))
+
+
+def _answer(number: int, reply: StartReply, actions: Actions) -> Actions:
+    yield from actions
+    yield Reply(number, reply.success, reply.message)
 
 
 def trajectory(command: SendStep | SendPath) -> m.Trajectory:
     """Return the trajectory of a step (one point) or a path (several)."""
     points = tuple(m.TrajectoryPoint((at, turn), time) for at, turn, time in command.points)
     return m.Trajectory(command.stamp_ns, (m.INSERTION_JOINT, m.ROTATION_JOINT), points)
-
-
-def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:
-    """Return the joint positions of a message that was sent at `sent_ns`.
-
-    Raises
-    ------
-    UserError
-        A joint is missing or not finite.
-    """
-    position = dict(zip(message.names, message.positions, strict=False))
-    missing = [name for name in (m.INSERTION_JOINT, m.ROTATION_JOINT) if name not in position]
-    if missing:
-        raise UserError(f"joint_states without {' and '.join(missing)}: {list(message.names)}")
-    insertion, rotation = position[m.INSERTION_JOINT], position[m.ROTATION_JOINT]
-    if not (math.isfinite(insertion) and math.isfinite(rotation)):
-        raise UserError(f"joint_states are not finite: {insertion} m, {rotation} rad")
-    return JointSample(message.stamp_ns, insertion, rotation, sent_ns)
 
 
 def tip_covariance(message: m.PoseWithCovariance, heading: Heading | None = None) -> TipCovariance:
@@ -358,7 +334,7 @@ def _pose(estimate: Estimate, stamp_ns: int) -> m.PoseWithCovariance:
         stamp_ns,
         TARGET_PLANE,
         (x, y, z),
-        quaternion_from_rotation(estimate.rotation.tolist()),
+        m.quaternion_from_rotation(estimate.rotation.tolist()),
         tuple(covariance.ravel().tolist()),
     )
 

@@ -125,7 +125,14 @@ def test_it_steers_in_steps_and_publishes_its_estimate() -> None:
     assert 2.0 * (x * z + w * y) == pytest.approx(np.sin(reduced.values[1]), abs=1e-12)
     assert point.positions[1] - before == pytest.approx(control.values[1] * 0.001)
     received = [one for s in bench.published[STATUS] for one in received_messages(s.heard)]
-    assert [one.topic for one in received[-2:]] == ["joint_states", "device/result"]
+    assert [topic for topic, _ in received[-2:]] == ["joint_states", "device/result"]
+    # A full log is published, although the status has not changed.
+    number = len(bench.published[STATUS])
+    for _ in range(201):
+        bench.joints(**bench.position)
+    logs = [received_messages(status.heard) for status in bench.published[STATUS][number:]]
+    assert [len(log) for log in logs] == [100, 100]
+    assert logs[1][-1] == ("joint_states", bench.now - TICK)
     assert bench.call("stop") == (True, "stopped")
     assert bench.status.state == "IDLE"
 

@@ -26,7 +26,7 @@ from needle_bags.reading.frames import flat_fields
 from needle_bags.rerun.comparison import FIELDS, Record
 from needle_bags.rerun.stages import Output, Stage
 from needle_bags.run.run_summary import estimate_error
-from needle_controller.controller_status import ReceivedMessage, received_messages
+from needle_controller.controller_status import received_messages
 from needle_core.message_types import to_nanoseconds
 
 POSE = "needle/tip_pose"
@@ -294,7 +294,7 @@ def in_reception_order(
 
 def _statuses(
     messages: Iterable[SentMessage], namespace: str
-) -> Iterator[tuple[SentMessage, list[ReceivedMessage]]]:
+) -> Iterator[tuple[SentMessage, list[tuple[str, int]]]]:
     for message in messages:
         if message.topic == namespace + _STATUS:
             status: Any = _STORE.deserialize_cdr(message.data, message.type_name)

@@ -17,11 +17,10 @@ from needle_controller.plane_controller import (
     TARGET_PLANE,
     TARGET_POINT,
     PlaneController,
-    joint_sample,
 )
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import SteeringState
-from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.joint_history import JointSample, joint_sample
 from needle_core.component import Actions, Input, Moment, Publish
 from needle_core.convert import from_ros, to_ros
 from needle_core.errors import UserError

@@ -7,7 +7,6 @@ import pytest
 from made_up_run import header, serialized, status
 from needle_bags.reading.bag_messages import SentMessage
 from needle_bags.rerun.bag_pass import in_reception_order
-from needle_controller.controller_status import ReceptionLog
 
 HEADER, STATUS = "std_msgs/msg/Header", "diagnostic_msgs/msg/DiagnosticStatus"
 
@@ -18,10 +17,8 @@ def sent(time: int, topic: str) -> SentMessage:
 
 def reception(time: int, *received: tuple[str, int]) -> SentMessage:
     """Return a controller status; `("joints", 7)`: it had received the joints sent at 7."""
-    log = ReceptionLog()
-    for topic, sent_ns in received:
-        log.add(topic, sent_ns)
-    data = serialized(status({"heard": log.pop_text()}))
+    heard = ", ".join(f"{topic} {sent_ns}" for topic, sent_ns in received)
+    data = serialized(status({"heard": heard}))
     return SentMessage(time, time, "/rig/needle/controller_status", STATUS, data)
 
 

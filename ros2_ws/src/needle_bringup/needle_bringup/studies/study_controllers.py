@@ -12,7 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from needle_bringup.studies.study_estimators import BestEstimators, Estimators, SeparateEstimators
+from needle_bringup.studies.study_estimators import (
+    BestEstimators,
+    Estimators,
+    PaperObservers,
+    PoseEstimators,
+    SeparateEstimators,
+)
 from needle_bringup.studies.study_laws import (
     PointLaws,
     best_point_laws,
@@ -24,7 +30,6 @@ from needle_bringup.studies.study_laws import (
     sliding_law,
 )
 from needle_controller.laws.law import LinearizingLaw
-from needle_controller.many_needles import ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.observers.estimator import Estimator
@@ -132,7 +137,7 @@ class NeedlesToPoints(SteeredNeedles):
 
     def __init__(
         self,
-        new_estimators: Callable[[int], Estimators],
+        new_estimators: Callable[[int], PoseEstimators],
         new_laws: Callable[[TargetMotion], PointLaws],
         covariance: Array | None = None,
         rotation_budget: float = math.inf,
@@ -156,7 +161,7 @@ class NeedlesToPoints(SteeredNeedles):
         belief = super().belief()
         if belief is None or belief.missed is None:
             return belief
-        assert self._estimators is not None
+        assert isinstance(self._estimators, PoseEstimators)
         tips, covariances = self._estimators.tips()
         missed = point_miss_probability(tips - self._motion.last, covariances)
         return dataclasses.replace(belief, missed=missed)
@@ -166,51 +171,6 @@ class NeedlesToPoints(SteeredNeedles):
             estimators, self._insertion, self._rotation_budget - self._turned
         )
         return rates
-
-
-class PaperNeedles:
-    """Observer and law of [KC09] in compiled loops; implements `study.Controller`.
-
-    Parameters
-    ----------
-    settings : SteeringSettings
-        Settings of preset `paper` or `open_loop`.
-    turn_delay : float
-        See `SteeredNeedles`.
-    """
-
-    def __init__(self, settings: SteeringSettings, turn_delay: float) -> None:
-        self._settings, self._turn_delay = settings, turn_delay
-        self._needles: ManyObservers | None = None
-
-    def start(self, tips: FloatArray) -> FloatArray:
-        """Handle the first measured tips; see `study.Controller.start`."""
-        gains = self._settings.gains()
-        law = make_law(self._settings, gains)
-        self._needles = ManyObservers(
-            observer_settings(self._settings, gains),
-            law.gains if isinstance(law, LinearizingLaw) else None,
-            len(tips),
-        )
-        return self._needles.start(tips)
-
-    def step(
-        self,
-        d_insertion: float | FloatArray,
-        d_rotation: FloatArray,
-        tips: FloatArray,
-        age: float | FloatArray,
-    ) -> FloatArray:
-        """Handle a step and the tips measured after it; see `study.Controller.step`."""
-        assert self._needles is not None
-        lengths = np.array(np.broadcast_to(d_insertion, len(tips)))
-        unturned = np.minimum(self._turn_delay, 0.9 * lengths)
-        ages = np.array(np.broadcast_to(age, len(tips)))
-        return self._needles.step(lengths, unturned, d_rotation, tips, ages)
-
-    def belief(self) -> Belief | None:
-        """Return None, because an observer with a steady-state gain has no covariance."""
-        return None
 
 
 def needles_at_a_time(name: str) -> int:
@@ -227,7 +187,7 @@ def controller_factory(
     turn_delay: float = 0.0,
     own: Mapping[str, Any] = {},
     first: int = 0,
-) -> Callable[[], SteeredNeedles | PaperNeedles]:
+) -> Callable[[], SteeredNeedles]:
     """Return a factory of the controller of a group of needles.
 
     Parameters
@@ -255,14 +215,20 @@ def controller_factory(
     """
     settings, covariance = _claimed_settings(name, claimed, sigma_scale, flip_depths, own)
     if name in ONE_SIDED_PRESETS and not settings.estimator and not settings.law:
-        return lambda: PaperNeedles(settings, turn_delay)
+        known, law = observer_settings(settings), make_law(settings)
+        weights = law.gains if isinstance(law, LinearizingLaw) else None
+        return lambda: SteeredNeedles(
+            lambda count: PaperObservers(known, count),
+            lambda observers, _: observers.rates(weights),
+            turn_delay=turn_delay,
+        )
     rates: Callable[[Any, float], FloatArray] = best_rates(settings)
     if settings.estimator or settings.law or name in ONE_SIDED_PRESETS:
         rates = each_rate(lambda _: make_controller(settings, np.eye(3))[1])
     return lambda: SteeredNeedles(new_estimators(settings, first), rates, covariance, turn_delay)
 
 
-def new_estimators(settings: SteeringSettings, first: int) -> Callable[[int], Estimators]:
+def new_estimators(settings: SteeringSettings, first: int) -> Callable[[int], PoseEstimators]:
     """Return a factory of the estimators of needles, numbered from `first`."""
     if settings.preset == "best" and not settings.estimator:
         known = filter_settings(settings)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from needle_controller.laws.roll_law import hypotheses_of
-from needle_controller.many_needles import ManyFilters
+from needle_controller.many_needles import ManyFilters, ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.observers.estimator import Estimate, Estimator
 from needle_sim.needle.se3 import FloatArray
@@ -27,11 +27,16 @@ class Estimators(Protocol):
     def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
         """Correct by tips, (N, 3) [m], given a covariance, (3, 3), and their ages, (N,) [m]."""
 
+    def belief(self) -> Belief | None:
+        """Return the estimates of all needles; None if they have no covariance."""
+
+
+@runtime_checkable
+class PoseEstimators(Estimators, Protocol):
+    """Estimators of the whole pose."""
+
     def each(self) -> Sequence[Estimate]:
         """Return the estimate of each needle."""
-
-    def belief(self) -> Belief:
-        """Return the estimates of all needles."""
 
     def tips(self) -> tuple[FloatArray, FloatArray]:
         """Return the estimated tips, (N, 3) [m], and their covariances, (N, 3, 3) [m^2]."""
@@ -79,7 +84,7 @@ class SeparateEstimators:
 
     def belief(self) -> Belief:
         """Return the estimates of all needles."""
-        uncertainty = np.array([hypotheses_of(known).uncertainty for known in self._known])
+        uncertainty = np.array([hypotheses_of(known).mean["uncertainty"] for known in self._known])
         s = np.array([known.linearized for known in self._known])
         missed = None
         if self._known[0].miss is not None:
@@ -104,6 +109,13 @@ class BestEstimators(ManyFilters):
         """Return the estimated tips and their covariances."""
         known = self.estimates
         return known["coordinates"][:, :3].copy(), known["covariance"][:, :3, :3].copy()
+
+
+class PaperObservers(ManyObservers):
+    """Observers of [KC09] in compiled loops; see `Estimators`."""
+
+    def belief(self) -> None:
+        """Return None, because an observer with a steady-state gain has no covariance."""
 
 
 def _belief(s: FloatArray, uncertainty: FloatArray, missed: FloatArray | None) -> Belief:

@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from needle_bringup.studies.study_estimators import Estimators
-from needle_controller.laws.flip_plan import FlipPlan
+from needle_bringup.studies.study_estimators import PoseEstimators
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.laws.point_turns import PointLawSettings
-from needle_controller.laws.roll_law import RollLawSettings
+from needle_controller.laws.roll_law import RollLawSettings, bend_sign
 from needle_controller.many_needles import ManyFilters
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.observers.estimator import Estimate
 from needle_controller.planning.obstacles import Obstacles
-from needle_controller.presets.path_steering import PathSteering, tip_state
-from needle_controller.presets.point_steering import ArrivalPrediction, prompt_point_law
+from needle_controller.presets.path_steering import PathSteering
+from needle_controller.presets.point_steering import ArrivalPrediction
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.point_study import INSERTION_SPEED
@@ -36,11 +35,11 @@ PointLaws = Callable[[Any, FloatArray, FloatArray], tuple[FloatArray, FloatArray
 [rad/m] and remaining insertions [m], (N,)."""
 
 
-def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[Estimators, float], FloatArray]:
+def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[PoseEstimators, float], FloatArray]:
     """Return a function for the rotation rates from laws that are called one by one."""
     laws: list[StepLaw] = []
 
-    def rates(estimators: Estimators, insertion: float) -> FloatArray:
+    def rates(estimators: PoseEstimators, insertion: float) -> FloatArray:
         known = estimators.each()
         laws.extend(new_law(n) for n in range(len(laws), len(known)))
         return np.array(
@@ -63,7 +62,7 @@ def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], Timed
     laws: list[tuple[TargetMotion, TimedLaw]] = []
 
     def commands(
-        estimators: Estimators, insertion: FloatArray, rotation_left: FloatArray
+        estimators: PoseEstimators, insertion: FloatArray, rotation_left: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         known = estimators.each()
         for _ in range(len(laws), len(known)):
@@ -84,10 +83,10 @@ def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], Timed
 
 def best_rates(settings: SteeringSettings) -> Callable[[ManyFilters, float], FloatArray]:
     """Return a function for the rotation rates from the law of `best`, in compiled loops."""
-    law, plan = RollLawSettings(**settings.turning), FlipPlan(settings.flip_depths)
+    law = RollLawSettings(**settings.turning)
 
     def rates(filters: ManyFilters, insertion: float) -> FloatArray:
-        return filters.roll_rates(law, plan.bend_sign(insertion))
+        return filters.roll_rates(law, bend_sign(settings.flip_depths, insertion))
 
     return rates
 
@@ -171,16 +170,11 @@ def planned_law(motion: TargetMotion, settings: SteeringSettings) -> TimedLaw:
     settings : SteeringSettings
         Settings of the needle, including the planner.
     """
-    law, free, plane = prompt_point_law(settings), Obstacles(), offset_plane(0.0)
-    needle = PathSteering(settings)
+    needle, free, plane = PathSteering(settings), Obstacles(), offset_plane(0.0)
+    # Without a path the needle stops.
+    stop = SteeringCommand(0.0, 0.0, -math.inf)
 
     def command(estimate: Estimate, _: float, insertion: float, __: float) -> SteeringCommand:
-        route = needle.route(tip_state(estimate, plane), motion.last, free, insertion)
-        if route is None:
-            # Without a path the needle stops.
-            return SteeringCommand(0.0, 0.0, -math.inf)
-        aimed = law(estimate, route.aim)
-        left = aimed.insertion_left if route.length is None else route.length
-        return SteeringCommand(aimed.virtual_input, aimed.rotation_rate, left)
+        return needle.command(estimate, plane, motion.last, free, insertion) or stop
 
     return command

@@ -108,7 +108,7 @@ def test_the_belief_follows_from_the_estimates() -> None:
     needles.step(0.001, np.zeros(2), TIPS, 0.0)
     belief = needles.belief()
     assert belief is not None
-    assert needles._estimators is not None
+    assert isinstance(needles._estimators, BestEstimators)
     for n, estimate in enumerate(needles._estimators.each()):
         pitch, covariance = estimate.coordinates[4], estimate.covariance
         assert belief.x[n] == pytest.approx(estimate.coordinates[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -61,38 +62,34 @@ def fit_checked(
     size = float(np.linalg.norm(chord))
     if size < 1e-4:
         raise UserError(f"the tips are all in one place (they move by {size:.3g} m)")
-    x, y, z = (float(v) for v in chord / size)
-    e, f, g = (float(v) for v in first)
-    free = fit_curvature(
-        tips,
-        insertion,
-        dataclasses.replace(
-            settings, heading=(x, y, z), heading_std=math.inf, entry=(e, f, g), entry_std=math.inf
-        ),
-    )
+    any_entry: dict[str, Any] = {"entry": tuple(first.tolist()), "entry_std": math.inf}
+    any_heading: dict[str, Any] = {
+        "heading": tuple((chord / size).tolist()),
+        "heading_std": math.inf,
+    }
+    unknown = dataclasses.replace(settings, **any_entry, **any_heading)
+    free = fit_curvature(tips, insertion, unknown)
+    off = np.asarray(free.entry) - settings.entry
+    if insertion is None:
+        # The start of the free fit is arbitrary along the arc.
+        off = off - free.heading * (off @ free.heading)
     warnings: list[str] = []
-    if math.isfinite(settings.entry_std):
-        off = np.asarray(free.entry) - settings.entry
-        if insertion is None:
-            # The start of the free fit is arbitrary along the arc.
-            off = off - free.heading * (off @ free.heading)
-        distance = float(np.linalg.norm(off))
-        allowed = _CONTRADICTION * math.hypot(settings.entry_std, float(free.entry_std))
-        if distance > allowed:
-            warnings.append(
-                f"the entry was not used: the tips start {1e3 * distance:.1f} mm from it, "
-                f"limit {1e3 * allowed:.1f} mm"
-            )
-            settings = dataclasses.replace(settings, entry=(e, f, g), entry_std=math.inf)
-    if math.isfinite(settings.heading_std):
-        angle = math.acos(min(1.0, max(-1.0, float(free.heading @ np.asarray(settings.heading)))))
-        allowed = _CONTRADICTION * math.hypot(settings.heading_std, float(free.heading_std))
-        if angle > allowed:
-            warnings.append(
-                f"the heading was not used: the tips start {math.degrees(angle):.1f} deg off it, "
-                f"limit {math.degrees(allowed):.1f} deg"
-            )
-            settings = dataclasses.replace(settings, heading=(x, y, z), heading_std=math.inf)
+    distance = float(np.linalg.norm(off))
+    allowed = _CONTRADICTION * math.hypot(settings.entry_std, float(free.entry_std))
+    if distance > allowed:
+        warnings.append(
+            f"the entry was not used: the tips start {1e3 * distance:.1f} mm from it, "
+            f"limit {1e3 * allowed:.1f} mm"
+        )
+        settings = dataclasses.replace(settings, **any_entry)
+    angle = math.acos(min(1.0, max(-1.0, float(free.heading @ np.asarray(settings.heading)))))
+    allowed = _CONTRADICTION * math.hypot(settings.heading_std, float(free.heading_std))
+    if angle > allowed:
+        warnings.append(
+            f"the heading was not used: the tips start {math.degrees(angle):.1f} deg off it, "
+            f"limit {math.degrees(allowed):.1f} deg"
+        )
+        settings = dataclasses.replace(settings, **any_heading)
     fit = fit_curvature(tips, insertion, settings)
     return dataclasses.replace(fit, warnings=tuple(warnings))
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from needle_controller.model.arrays import Array
+from needle_controller.model.target_plane import point_from_message
+from needle_controller.protocol.joint_history import joint_sample
 from needle_core.commands.csv_files import read_insertions, read_rows
 from needle_core.commands.options import number
+from needle_core.convert import from_ros
 from needle_core.errors import UserError
-from needle_core.message_types import to_nanoseconds
+from needle_core.messages import JointState, Point
 
 _COORDINATES = ("x_m", "y_m", "z_m")
 _LARGEST = {"m": 1.0, "rad": 1e4}
@@ -155,8 +158,8 @@ def read_bag(path: Path) -> InsertionRecord:
     # Imported here, because reading a CSV does not need it.
     from needle_core.files.bag_directory import BagDirectory  # noqa: PLC0415
 
-    tips: dict[int, list[float]] = {}
-    joints: dict[int, list[float]] = {}
+    tips: dict[int, Array] = {}
+    joints: dict[int, tuple[float, float]] = {}
 
     def is_selected(topic: str) -> bool:
         return ("/" + topic.lstrip("/")).endswith(("/needle/tip", "/joint_states"))
@@ -166,10 +169,15 @@ def read_bag(path: Path) -> InsertionRecord:
         for sent in bag.messages(is_selected):
             message = bag.deserialize(store, sent)
             try:
-                if sent.topic.endswith("needle/tip"):
-                    _read_tip(path, message, tips)
-                else:
-                    _read_joints(message, joints)
+                if sent.topic.endswith("joint_states"):
+                    # Others may publish other joints.
+                    with contextlib.suppress(UserError):
+                        at = joint_sample(from_ros(JointState, message), sent.time)
+                        joints.setdefault(at.stamp_ns, (at.insertion, at.rotation))
+                    continue
+                tip = from_ros(Point, message)
+                point = point_from_message(f"{path}: a tip", tip.frame_id, tip.position)
+                tips.setdefault(tip.stamp_ns, point)
             except AttributeError as error:
                 raise UserError(f"{path}: {sent.topic} has an unexpected type: {error}") from error
     for topic, found in (("needle/tip", tips), ("joint_states", joints)):
@@ -178,30 +186,12 @@ def read_bag(path: Path) -> InsertionRecord:
     times = np.array(sorted(joints), dtype=np.int64)
     values = np.array([joints[t] for t in times.tolist()])
     stamps = np.array([t for t in sorted(tips) if times[0] <= t <= times[-1]], dtype=np.int64)
-    at, known = (stamps - times[0]).astype(float), (times - times[0]).astype(float)
+    then, known = (stamps - times[0]).astype(float), (times - times[0]).astype(float)
     return InsertionRecord(
         np.array([tips[t] for t in stamps.tolist()]).reshape(-1, 3),
-        np.interp(at, known, values[:, 0]),
-        np.interp(at, known, values[:, 1]),
+        np.interp(then, known, values[:, 0]),
+        np.interp(then, known, values[:, 1]),
     )
-
-
-def _read_tip(path: Path, message: Any, tips: dict[int, list[float]]) -> None:
-    position = [float(message.point.x), float(message.point.y), float(message.point.z)]
-    if not np.all(np.isfinite(position)):
-        raise UserError(f"{path}: a tip is not finite: {position}")
-    if message.header.frame_id != "rig":
-        raise UserError(f"{path}: a tip is in frame '{message.header.frame_id}', expected 'rig'")
-    tips.setdefault(to_nanoseconds(message.header.stamp), position)
-
-
-def _read_joints(message: Any, joints: dict[int, list[float]]) -> None:
-    position: dict[str, float] = dict(zip(message.name, message.position, strict=False))
-    if "insertion_joint" in position and "rotation_joint" in position:
-        joints.setdefault(
-            to_nanoseconds(message.header.stamp),
-            [float(position["insertion_joint"]), float(position["rotation_joint"])],
-        )
 
 
 def _number(where: str, row: dict[str, str], name: str) -> float:

@@ -192,7 +192,7 @@ def _forecast(
     if options.forecast_mm is None:
         return dict.fromkeys(names)
     ahead = forecast_tip(record.tips, fit, 1e-3 * options.forecast_mm)
-    values = 1e3 * np.concatenate([ahead.tip, ahead.interval()])
+    values = 1e3 * np.concatenate(ahead)
     return dict(zip(names, values.tolist(), strict=True))
 
 

@@ -14,8 +14,6 @@ known, and that of a flexible needle is not straightened.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from needle_controller.curvature.curvature_fit import CurvatureFit
@@ -32,27 +30,7 @@ _CELL = 0.004
 """Length over which the local curvature is constant [m]."""
 
 
-@dataclasses.dataclass(frozen=True)
-class TipForecast:
-    """Predicted tip.
-
-    Attributes
-    ----------
-    tip : ndarray, shape (3,)
-        Predicted tip in `rig` [m].
-    covariance : ndarray, shape (3, 3)
-        Covariance of the tip [m^2].
-    """
-
-    tip: Array
-    covariance: Array
-
-    def interval(self) -> Array:
-        """Return the half-width of each coordinate's 95 % interval, (3,) [m]."""
-        return np.asarray(1.96 * np.sqrt(np.diagonal(self.covariance)))
-
-
-def forecast_tip(tips: Array, fit: CurvatureFit, insertion: float) -> TipForecast:
+def forecast_tip(tips: Array, fit: CurvatureFit, insertion: float) -> tuple[Array, Array]:
     """Return the predicted tip at an insertion without rotation.
 
     Parameters
@@ -66,8 +44,10 @@ def forecast_tip(tips: Array, fit: CurvatureFit, insertion: float) -> TipForecas
 
     Returns
     -------
-    TipForecast
-        Predicted tip and its uncertainty, for the fitted noise.
+    tip : ndarray, shape (3,)
+        Predicted tip in `rig` [m].
+    interval : ndarray, shape (3,)
+        Half-width of each coordinate's 95 % interval, for the fitted noise [m].
     """
     settings, insertion_known = fit.settings, fit.insertion_known
     axes, entry = frame(np.asarray(settings.heading)), np.asarray(settings.entry)
@@ -107,7 +87,8 @@ def forecast_tip(tips: Array, fit: CurvatureFit, insertion: float) -> TipForecas
     mean = share @ np.array(means)
     off = np.array(means) - mean
     spread = np.tensordot(share, np.array(covariances) + off[:, :, None] * off[:, None], 1)
-    return TipForecast(entry + axes @ mean, axes @ spread @ axes.T)
+    covariance = axes @ spread @ axes.T
+    return entry + axes @ mean, 1.96 * np.sqrt(np.diagonal(covariance))
 
 
 def _local_slopes(unknowns: Array, stations: Array) -> Array:

@@ -6,20 +6,18 @@ exposure. Angles of base and tip are relative to the start.
 """
 
 # Numba functions take positional arguments: keywords are slow or unsupported.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from needle_controller.filter.heading_update import update_by_heading
 from needle_controller.filter.late_tips import FIRST, LAST, hidden_age
 from needle_controller.filter.merging import copy_hypothesis, merge, remove_weightless
 from needle_controller.filter.motion import LARGEST_TURN, advance_hypothesis
-from needle_controller.filter.records import E_TURN, ERROR, LONGEST_QUEUE
+from needle_controller.filter.records import E_TURN, ERROR, LONGEST_QUEUE, Bank
 from needle_controller.filter.tip_update import (
     Reading,
     new_reading,
@@ -27,10 +25,8 @@ from needle_controller.filter.tip_update import (
     prepare_reading,
     update_hypothesis,
 )
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_core.compiled import compiled
-
-Records = npt.NDArray[np.void]
 
 MERGE_EVERY = 8
 """Number of tips between two merges of equal hypotheses."""
@@ -50,38 +46,25 @@ _JUMP_TURN_VARIANCE = math.radians(2.0) ** 2
 
 
 @compiled
-def start_needle(
-    needle: Any,
-    hypotheses: Records,
-    prior: Records,
-    tip: Array,
-    insertion: float,
-    turn: float,
-    assumed: Any,
-) -> None:
-    """Start at a first tip; entry and initial rotation of `needle` must already be set.
+def start_needle(bank: Bank, n: int, tip: Array, insertion: float, turn: float) -> None:
+    """Start needle n at a first tip; its entry and initial rotation must already be set.
 
     Parameters
     ----------
-    needle : NEEDLE, changed
-        The needle.
-    hypotheses : ndarray of HYPOTHESIS, shape (H + 1,), changed
-        Storage for its hypotheses.
-    prior : ndarray of HYPOTHESIS, shape (H,)
-        Hypotheses of a needle that enters along z with its base at 0.
+    bank, n : Bank, int
+        Filters, and the number of the needle.
     tip : ndarray, shape (3,)
         The measured tip [m]; NaN if there is none.
     insertion, turn : float
         Joint positions at the same instant [m], [rad].
-    assumed : ASSUMPTIONS
-        Assumptions of the filter.
     """
+    needle = bank.needles[n]
     needle.events = needle.pending = 0
     needle.start_insertion, needle.start_turn = insertion, turn
     needle.inserted = needle.late = 0.0
     for k in range(3):
         needle.start[k] = tip[k]
-    _start_hypotheses(needle, hypotheses, prior, assumed)
+    _start_hypotheses(needle, bank.hypotheses[n], bank.prior, bank.assumed[0])
 
 
 @compiled
@@ -115,22 +98,13 @@ def _start_hypotheses(needle: Any, hypotheses: Records, prior: Records, assumed:
 
 
 @compiled
-def advance_needle(
-    needle: Any, hypotheses: Records, events: Records, length: float, turn: float, assumed: Any
-) -> None:
-    """Queue a motion of the base until the next tip: inserted length [m] and rotation [rad].
-
-    Parameters
-    ----------
-    needle, hypotheses : NEEDLE, ndarray of HYPOTHESIS, changed
-        See `start_needle`.
-    events : ndarray of EVENT, changed
-        Storage for the events of the first centimetres.
-    """
+def advance_needle(bank: Bank, n: int, length: float, turn: float) -> None:
+    """Queue a motion of needle n's base until the next tip: insertion [m] and rotation [rad]."""
+    needle = bank.needles[n]
     needle.inserted += length
     if needle.events >= 0:
-        _record_event(needle, events, length, turn)
-    _queue(needle, hypotheses, length, turn, assumed)
+        _record_event(needle, bank.events[n], length, turn)
+    _queue(needle, bank.hypotheses[n], length, turn, bank.assumed[0])
 
 
 @compiled
@@ -212,26 +186,15 @@ def predicted_hypotheses(needle: Any, hypotheses: Records, assumed: Any) -> Reco
 
 
 @compiled
-def correct_needle(
-    needle: Any,
-    hypotheses: Records,
-    events: Records,
-    prior: Records,
-    tip: Array,
-    covariance: Array,
-    age: float,
-    assumed: Any,
-) -> None:
-    """Apply a measured tip.
+def correct_needle(bank: Bank, n: int, tip: Array, covariance: Array, age: float) -> None:
+    """Apply a measured tip of needle n.
 
     The events of the first centimetres are recorded. If they show that the tips are late, they are
     replayed with that age, which is assumed for later tips, too.
 
     Parameters
     ----------
-    needle, hypotheses, events : changed
-        See `advance_needle`.
-    prior : ndarray of HYPOTHESIS
+    bank, n : Bank, int
         See `start_needle`.
     tip : ndarray, shape (3,)
         The tip [m]; NaN if it was not found.
@@ -240,9 +203,10 @@ def correct_needle(
     age : float
         Stated insertion since the exposure of the tip [m].
     """
-    reading = new_reading()
-    _set_reading(reading, tip, covariance, needle.heading)
+    needle, hypotheses, events = bank.needles[n], bank.hypotheses[n], bank.events[n]
+    assumed, heading = bank.assumed[0], needle.heading.copy()
     needle.heading[3] = 0.0
+    reading = new_reading(tip, covariance, heading)
     _apply_tip(needle, hypotheses, reading, age + needle.late, assumed)
     if needle.events < 0:
         return
@@ -257,19 +221,19 @@ def correct_needle(
         for j in range(3):
             event.covariance[i, j] = covariance[i, j]
     for i in range(4):
-        event.heading[i] = reading.heading[i]
+        event.heading[i] = heading[i]
     if needle.inserted < LAST:
         return
     count, needle.events = needle.events, -1
     needle.late = _estimated_age(needle, events[:count], assumed)
     if needle.late > 0.0:
         needle.pending = 0
-        _start_hypotheses(needle, hypotheses, prior, assumed)
+        _start_hypotheses(needle, hypotheses, bank.prior, assumed)
         for k in range(count):
             event = events[k]
             _queue(needle, hypotheses, event.length, event.turn, assumed)
             if event.is_tip:
-                _set_reading(reading, event.tip, event.covariance, event.heading)
+                reading = new_reading(event.tip, event.covariance, event.heading)
                 _apply_tip(needle, hypotheses, reading, event.age + needle.late, assumed)
 
 
@@ -289,17 +253,6 @@ def _estimated_age(needle: Any, events: Records, assumed: Any) -> float:
         for i in range(3):
             too_deep += (needle.start[i] - needle.entry[i]) * needle.initial_rotation[i, 2]
     return hidden_age(inserted, shifts, too_deep, entry_std, assumed.effective_bound)
-
-
-@compiled
-def _set_reading(reading: Reading, tip: Array, covariance: Array, heading: Array) -> None:
-    """Set a tip, its covariance and the heading measured with it."""
-    for i in range(3):
-        reading.tip[i] = tip[i]
-        for j in range(3):
-            reading.covariance[i, j] = covariance[i, j]
-    for i in range(4):
-        reading.heading[i] = heading[i]
 
 
 @compiled

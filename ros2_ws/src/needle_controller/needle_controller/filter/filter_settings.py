@@ -15,8 +15,13 @@ from needle_controller.filter.records import (
     E_SCALE,
     E_TORSION,
     E_TURN,
+    ESTIMATE,
+    EVENT,
     HYPOTHESIS,
+    NEEDLE,
     NOISES,
+    TORSION,
+    Bank,
 )
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
@@ -236,6 +241,19 @@ class FilterSettings:
         assumed["outlier_share"] = self.outlier_share
         assumed["jump_share"] = self.jump_share
         return cast(np.void, assumed)
+
+    def bank(self, count: int, events: int) -> Bank:
+        """Return the filters of `count` needles, with storage for `events` events each."""
+        prior, torsions = self.prior(), len(self.torsion_hypotheses)
+        return Bank(
+            np.zeros(count, NEEDLE),
+            np.empty((count, prior.size + 1), HYPOTHESIS),
+            np.zeros((count, events), EVENT),
+            prior,
+            np.array([self.assumptions()]),
+            np.zeros(count, ESTIMATE),
+            np.zeros((count, torsions), TORSION),
+        )
 
     def noises(self) -> Array:
         """Return multiples, shares and correlations of each shape, (3, 3, NOISES)."""

@@ -13,10 +13,18 @@ import numpy.typing as npt
 from needle_controller.filter.bank import advance_needle, correct_needle, start_needle
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.mixture import estimate_from_record, estimate_needle
-from needle_controller.filter.records import ERROR, ESTIMATE, EVENT, HYPOTHESIS, NEEDLE, TORSION
+from needle_controller.filter.records import ERROR
 from needle_controller.observers.estimator import Estimate
 
 AMBIGUOUS_WEIGHT = 0.1
+MAX_OUTLIERS = 0.35
+"""Largest acceptable share of outliers among about the last ten tips."""
+LARGEST_NOISE = 3.0
+"""Largest acceptable noise, relative to the claimed one."""
+LARGEST_SLIP = 0.15
+"""Largest acceptable distance of the insertion scale from 1."""
+_AT_LIMIT = 0.03
+LATE = "tips lag the insertion from the start: late tips or a stuck needle; assumed late"
 _EVENTS = 4096
 """Largest number of recorded events of the first 2 cm, for the detection of late tips."""
 
@@ -44,35 +52,24 @@ class HypothesisFilter:
         initial_rotation: npt.ArrayLike | None = None,
         entry: npt.ArrayLike | None = None,
     ) -> None:
-        self.settings = settings
-        self._prior, self._assumed = settings.prior(), settings.assumptions()
-        self.needle = np.zeros(1, NEEDLE)[0]
+        self.settings, self._bank = settings, settings.bank(1, _EVENTS)
+        self.needle = self._bank.needles[0]
         self.needle["initial_rotation"] = (
             np.eye(3) if initial_rotation is None else initial_rotation
         )
         if entry is not None:
             self.needle["has_entry"], self.needle["entry"] = True, entry
-        self._hypotheses = np.zeros(self._prior.size + 1, HYPOTHESIS)
-        self._events = np.zeros(_EVENTS, EVENT)
         self.reset(np.zeros(3), np.zeros(2))
 
     @property
     def hypotheses(self) -> npt.NDArray[np.void]:
         """View of the present hypotheses, shape (H,), `records.HYPOTHESIS`."""
-        return self._hypotheses[: self.needle["count"]]
+        return self._bank.hypotheses[0, : self.needle["count"]]
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start at a first measurement (NaN: position unknown); see `Estimator.reset`."""
         insertion, turn = np.asarray(joints, dtype=float).tolist()
-        start_needle(
-            self.needle,
-            self._hypotheses,
-            self._prior,
-            np.array(tip, dtype=float),
-            insertion,
-            turn,
-            self._assumed,
-        )
+        start_needle(self._bank, 0, np.array(tip, dtype=float), insertion, turn)
 
     def advance(self, d_insertion: float, d_rotation: float) -> None:
         """Advance by the actual motion; see `Estimator.advance`."""
@@ -81,7 +78,7 @@ class HypothesisFilter:
             raise ValueError(f"d_insertion = {length!r} m, expected finite and >= 0")
         if not np.isfinite(turn):
             raise ValueError(f"d_rotation = {turn!r} rad, expected finite")
-        advance_needle(self.needle, self._hypotheses, self._events, length, turn, self._assumed)
+        advance_needle(self._bank, 0, length, turn)
 
     def correct(
         self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
@@ -92,16 +89,8 @@ class HypothesisFilter:
         Gaussian; in both cases it includes `model_error`. A tip older than the last one is dropped
         with a warning.
         """
-        correct_needle(
-            self.needle,
-            self._hypotheses,
-            self._events,
-            self._prior,
-            np.array(tip, dtype=float),
-            self.settings.tip_covariance(covariance),
-            float(age),
-            self._assumed,
-        )
+        noise = self.settings.tip_covariance(covariance)
+        correct_needle(self._bank, 0, np.array(tip, dtype=float), noise, float(age))
 
     def correct_heading(self, direction: npt.ArrayLike, variance: float) -> None:
         """Use a measured heading in the next `correct`.
@@ -117,10 +106,9 @@ class HypothesisFilter:
 
     def estimate(self) -> Estimate:
         """Return the present estimate; see `Estimator.estimate`."""
-        record = np.zeros(1, ESTIMATE)[0]
-        torsions = np.zeros(len(self.settings.torsion_hypotheses), TORSION)
-        estimate_needle(self.needle, self._hypotheses, record, torsions, self._assumed)
-        return estimate_from_record(record, torsions, self._warnings(float(record["ambiguous"])))
+        estimate_needle(self._bank, 0)
+        mean, torsions = self._bank.estimates[0].copy(), self._bank.torsions[0].copy()
+        return estimate_from_record(mean, torsions, self._warnings(mean))
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
         """Transform everything into another target plane; see `Estimator.change_frame`."""
@@ -136,17 +124,25 @@ class HypothesisFilter:
         turns = np.eye(ERROR)
         turns[:3, :3] = turns[3:6, 3:6] = turn
         h["covariance"] = turns @ h["covariance"] @ turns.T
-        events = self._events[: max(needle["events"], 0)]
+        events = self._bank.events[0, : max(needle["events"], 0)]
         events["tip"] = events["tip"] @ turn.T + shift
         events["covariance"] = turn @ events["covariance"] @ turn.T
         events["heading"][:, :3] = events["heading"][:, :3] @ turn.T
 
-    def _warnings(self, ambiguous: float) -> tuple[str, ...]:
-        warnings = []
-        if ambiguous > AMBIGUOUS_WEIGHT:
-            warnings.append(f"the roll is ambiguous: {100.0 * ambiguous:.0f} % for another value")
-        if self.needle["outlier_probability"] > 0.5:
-            warnings.append("tip refused as an outlier")
-        if self.needle["tip_too_late"]:
-            warnings.append("tip dropped: it is older than the last one used")
-        return tuple(warnings)
+    def _warnings(self, mean: np.void) -> tuple[str, ...]:
+        needle, assumed, ambiguous = self.needle, self._bank.assumed[0], mean["ambiguous"]
+        margin = _AT_LIMIT * assumed["curvature"]
+        low, high = assumed["smallest_curvature"] + margin, assumed["largest_curvature"] - margin
+        warnings = {
+            f"the roll is ambiguous: {100.0 * ambiguous:.0f} % for another value": (
+                ambiguous > AMBIGUOUS_WEIGHT
+            ),
+            "tip refused as an outlier": needle["outlier_probability"] > 0.5,
+            "tip dropped: it is older than the last one used": needle["tip_too_late"],
+            "too many tips are outliers": needle["mean_outlier_probability"] > MAX_OUTLIERS,
+            "tips are far noisier than claimed": mean["noise"] > LARGEST_NOISE,
+            "the needle does not advance with the stage": abs(mean["scale"] - 1.0) > LARGEST_SLIP,
+            "the curvature is at its limit": not low <= mean["curvature"] <= high,
+            LATE: needle["late"] > 0.0,
+        }
+        return tuple(text for text, applies in warnings.items() if applies)

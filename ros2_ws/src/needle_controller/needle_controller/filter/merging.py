@@ -6,14 +6,11 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from needle_controller.filter.motion import rotate
 from needle_controller.filter.records import E_KAPPA, E_SCALE, E_TORSION, E_TURN, ERROR, HYPOTHESIS
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_core.compiled import compiled
-
-Records = npt.NDArray[np.void]
 
 _SAME_ANGLE = 0.35
 """Largest difference of rolls that count as equal [rad]."""
@@ -50,7 +47,7 @@ def merge(needle: Any, hypotheses: Records) -> None:
     Parameters
     ----------
     needle, hypotheses : NEEDLE, ndarray of HYPOTHESIS, changed
-        See `start_needle`.
+        A needle of a `Bank`, and its hypotheses.
     """
     difference = np.empty(ERROR)
     for first in range(needle.count):

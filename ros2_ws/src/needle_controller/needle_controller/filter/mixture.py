@@ -6,69 +6,40 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from needle_controller.filter.bank import predicted_hypotheses
 from needle_controller.filter.filter_settings import CORRELATED, NORMAL
-from needle_controller.filter.records import E_TURN, NEAR, NOISES
+from needle_controller.filter.records import E_TURN, NEAR, NOISES, Bank
 from needle_controller.filter.tip_update import SMALLEST_VARIANCE
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_controller.model.kinematics import angle_axes
 from needle_controller.observers.estimator import Estimate, Hypotheses
 from needle_core.compiled import compiled
 
-Records = npt.NDArray[np.void]
-
-LATE = "tips lag the insertion from the start: late tips or a stuck needle; assumed late"
-WARNINGS = (
-    "too many tips are outliers",
-    "tips are far noisier than claimed",
-    "the needle does not advance with the stage",
-    "the curvature is at its limit",
-    LATE,
-)
-"""Warnings of an estimate, in the order of their bits."""
-MAX_OUTLIER_PROBABILITY = 0.35
-"""Largest acceptable share of outliers among about the last ten tips."""
-LARGEST_NOISE = 3.0
-"""Largest acceptable noise, relative to the claimed one."""
-LARGEST_SLIP = 0.15
-"""Largest acceptable distance of the insertion scale from 1."""
 HIDDEN_SHARE = 0.5
 """Assumed systematic part of a claimed variance that the tips do not reveal."""
-_AT_LIMIT = 0.03
 _AMBIGUOUS_COSINE = math.cos(math.radians(60.0))
 _NO_MEAN_ROLL = 0.1
 
 
 @compiled
-def estimate_needle(
-    needle: Any, hypotheses: Records, estimate: Any, torsions: Records, assumed: Any
-) -> None:
-    """Compute the estimate of a needle.
+def estimate_needle(bank: Bank, n: int) -> None:
+    """Compute the estimate of needle n.
 
-    Parameters
-    ----------
-    needle, hypotheses : NEEDLE, ndarray of HYPOTHESIS
-        See `bank.start_needle`.
-    estimate : ESTIMATE, changed
-        Position and heading are weighted means; the roll is the mean direction of the tip's x axis
-        about the heading, or that of the likeliest hypothesis if the directions cancel.
-    torsions : ndarray of TORSION, shape (K,), changed
-        Mean over the hypotheses of each torsion.
-    assumed : ASSUMPTIONS
-        As for `bank.advance_needle`.
+    Position and heading are weighted means; the roll is the mean direction of the tip's x axis
+    about the heading, or that of the likeliest hypothesis if the directions cancel.
     """
-    every = predicted_hypotheses(needle, hypotheses, assumed)
+    needle, estimate, assumed = bank.needles[n], bank.estimates[n], bank.assumed[0]
+    every = predicted_hypotheses(needle, bank.hypotheses[n], assumed)
     whole, best = 0.0, 0
-    for n in range(needle.count):
-        whole += every[n].weight
-        if every[n].weight > every[best].weight:
-            best = n
+    for m in range(needle.count):
+        whole += every[m].weight
+        if every[m].weight > every[best].weight:
+            best = m
     position, heading, side = np.zeros(3), np.zeros(3), np.zeros(3)
     bend = curvature = scale = xx = x_pitch = pitch_pitch = ambiguous = miss = 0.0
-    for n in range(needle.count):
-        h = every[n]
+    for m in range(needle.count):
+        h = every[m]
         w, r, p = h.weight / whole, h.rotation, h.covariance
         along = 0.0
         for k in range(3):
@@ -112,8 +83,7 @@ def estimate_needle(
         estimate.base += needle.pending_turn[k]
     estimate.wound = estimate.base + needle.start_turn
     estimate.miss = miss
-    estimate.warnings = _warnings(needle, estimate, assumed)
-    _average_torsions(every, whole, torsions)
+    _average_torsions(every, whole, bank.torsions[n])
     _write_covariance(needle, every, whole, estimate, assumed)
 
 
@@ -161,20 +131,6 @@ def _noise_size(h: Any, noises: Array) -> float:
             size += h.noise_weights[i, m] * noises[h.shape, 0, m]
         largest = max(largest, size)
     return largest
-
-
-@compiled
-def _warnings(needle: Any, estimate: Any, assumed: Any) -> int:
-    """Return the active `WARNINGS` as bits."""
-    low, high = assumed.smallest_curvature, assumed.largest_curvature
-    margin = _AT_LIMIT * assumed.curvature
-    return int(
-        (needle.mean_outlier_probability > MAX_OUTLIER_PROBABILITY)
-        + 2 * (estimate.noise > LARGEST_NOISE)
-        + 4 * (abs(estimate.scale - 1.0) > LARGEST_SLIP)
-        + 8 * (estimate.curvature < low + margin or estimate.curvature > high - margin)
-        + 16 * (needle.late > 0.0)
-    )
 
 
 @compiled
@@ -256,7 +212,6 @@ def estimate_from_record(
     record: np.void, torsions: Records, warnings: tuple[str, ...] = ()
 ) -> Estimate:
     """Return the `Estimate` of a record, an ESTIMATE with its TORSION, shape (K,)."""
-    warnings += tuple(why for k, why in enumerate(WARNINGS) if record["warnings"] >> k & 1)
     # A change of the angles turns the tip by axes @ change.
     to_angles = np.eye(6)
     to_angles[3:, 3:] = np.linalg.inv(angle_axes(record["coordinates"][3:]))
@@ -267,7 +222,5 @@ def estimate_from_record(
         covariance=to_angles @ record["covariance"] @ to_angles.T,
         warnings=warnings,
         miss=float(record["miss"]),
-        hypotheses=Hypotheses(
-            torsions, float(record["base"]), float(record["wound"]), record["uncertainty"]
-        ),
+        hypotheses=Hypotheses(record, torsions),
     )

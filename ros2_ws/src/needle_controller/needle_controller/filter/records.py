@@ -6,7 +6,11 @@ Compiled code reads and writes the fields by name. Everything is SI, in the fram
 # Read by compiled code.
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+
+from needle_controller.model.arrays import Records
 
 ERROR = 9
 """Length of a hypothesis's error: position [m], rotation vector [rad] (the true orientation is
@@ -95,7 +99,6 @@ ESTIMATE = np.dtype(
         ("ambiguous", np.float64),  # weight of rolls more than 60 deg from the likeliest
         ("base", np.float64),  # rotation of the base since the start [rad]
         ("wound", np.float64),  # position of the rotation joint [rad]
-        ("warnings", np.int64),  # bit k: number k of `WARNINGS`
     ]
 )
 TORSION = np.dtype(
@@ -129,3 +132,31 @@ ASSUMPTIONS = np.dtype(
 )
 """`FilterSettings` for compiled code; standard deviations and drifts are squared if only their
 squares are used."""
+
+
+class Bank(NamedTuple):
+    """Filters of N needles.
+
+    Attributes
+    ----------
+    needles : ndarray of NEEDLE, shape (N,)
+        The needles.
+    hypotheses : ndarray of HYPOTHESIS, shape (N, H + 1)
+        Storage for their hypotheses.
+    events : ndarray of EVENT, shape (N, E)
+        Storage for the events of the first centimetres.
+    prior : ndarray of HYPOTHESIS, shape (H,)
+        Hypotheses of a needle that enters along z with its base at 0.
+    assumed : ndarray of ASSUMPTIONS, shape (1,)
+        Assumptions of the filters.
+    estimates, torsions : ndarray of ESTIMATE, TORSION, shape (N,), (N, K)
+        Last estimates, and the mean over the hypotheses of each torsion.
+    """
+
+    needles: Records
+    hypotheses: Records
+    events: Records
+    prior: Records
+    assumed: Records
+    estimates: Records
+    torsions: Records

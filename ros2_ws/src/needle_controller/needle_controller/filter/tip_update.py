@@ -84,10 +84,9 @@ def new_workspace() -> Workspace:
 
 
 @compiled
-def new_reading() -> Reading:
-    """Return an uninitialized reading."""
-    tip, values, bounds = np.empty(3), np.empty(3), np.empty(3)
-    return Reading(tip, np.empty((3, 3)), np.empty(4), np.empty((3, 3)), values, bounds)
+def new_reading(tip: Array, covariance: Array, heading: Array) -> Reading:
+    """Return a reading whose components `prepare_reading` computes."""
+    return Reading(tip, covariance, heading, np.empty((3, 3)), np.empty(3), np.empty(3))
 
 
 @compiled

@@ -8,11 +8,10 @@ the uncertainty, shrinks to zero over the last centimetres, where errors can no 
 corrected. Each hypothesis then determines the turn of the base for that turn of the tip.
 """
 
-# Compiled code handles keyword arguments slowly or not at all.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,13 +25,11 @@ from needle_controller.laws.point_turns import (
     write_lateral_offset,
 )
 from needle_controller.laws.roll_law import allowed_turn, base_turn, hypotheses_of
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import ROLL
 from needle_controller.observers.estimator import Estimate
 from needle_core.compiled import compiled
-
-Records = npt.NDArray[np.void]
 
 
 class PointLaw:
@@ -66,18 +63,8 @@ class PointLaw:
             Remaining rotation of the base, in either direction [rad]; the less remains, the less
             often it turns.
         """
-        known = hypotheses_of(estimate)
-        turn, left = point_turn(
-            np.array(estimate.coordinates),
-            float(estimate.curvature),
-            known.uncertainty,
-            known.torsions,
-            known.base,
-            known.wound,
-            np.array(target, dtype=float),
-            float(rotation_left),
-            self.settings,
-        )
+        goal = np.array(target, dtype=float)
+        turn, left = point_turn(*hypotheses_of(estimate), goal, float(rotation_left), self.settings)
         rate = turn / self.settings.step_length
         virtual = virtual_input(estimate.reduced, rate, estimate.curvature)
         return SteeringCommand(float(virtual), rate, left)
@@ -85,12 +72,8 @@ class PointLaw:
 
 @compiled
 def point_turn(
-    coordinates: Array,
-    curvature: float,
-    uncertainty: Array,
+    estimate: Any,
     torsions: Records,
-    base: float,
-    wound: float,
     target: Array,
     rotation_left: float,
     settings: PointLawSettings,
@@ -99,9 +82,7 @@ def point_turn(
 
     Parameters
     ----------
-    coordinates, curvature : ndarray, shape (6,), float
-        Coordinates of the tip, and curvature of its path [1/m].
-    uncertainty, torsions, base, wound :
+    estimate, torsions : ESTIMATE, ndarray of TORSION
         See `Hypotheses`.
     target : ndarray, shape (3,)
         Target of the tip [m].
@@ -110,6 +91,8 @@ def point_turn(
     settings : PointLawSettings
         The settings.
     """
+    coordinates, uncertainty = estimate.coordinates, estimate.uncertainty
+    curvature, wound = estimate.curvature, estimate.wound
     ahead, need = _in_frame_of_tip(coordinates, target), np.empty(2)
     arc_length = write_lateral_offset(ahead, need)
     left = insertion_to_closest_point(ahead, arc_length, curvature)
@@ -132,7 +115,7 @@ def point_turn(
             tip_turn = allowed_turn(to_torsion, wound, settings.max_winding)[0]
         if abs(tip_turn) < settings.scatter_dead_band * (1.0 - t.agreement):
             tip_turn = 0.0
-        base_turned = base_turn(t, tip_turn, base, settings.step_length)
+        base_turned = base_turn(t, tip_turn, estimate.base, settings.step_length)
         turns += t.weight * min(max(base_turned, -settings.largest_turn), settings.largest_turn)
         weights += t.weight
     most = min(settings.max_rotation_per_length * settings.step_length, rotation_left)

@@ -8,12 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_core.compiled import compiled
-
-Records = npt.NDArray[np.void]
 
 _BEVEL = -0.5 * math.pi
 """Direction in which a needle bends, about its heading from its x axis [rad]: -y."""

@@ -6,30 +6,32 @@ curvature; near it, it is proportional to the distance. The desired s3 brings th
 the tip takes the shorter turn to one of the two rolls that have this s3. Each torsion determines
 the rotation of the base that turns the tip through play and lag; the mean over all torsions is
 used.
+
+Within the plane, the needle bends to the side given by the sign of cos(roll). Turning the bevel
+over at planned depths makes it follow a path of arcs (Reed et al., Integrated planning and
+image-guided control for planar needle steering, BioRob 2008), while the law keeps it in the plane.
 """
 
-# Numba functions take positional arguments: keywords are slow or unsupported.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from needle_controller.filter.records import TORSION
+from needle_controller.filter.records import ESTIMATE, TORSION
 from needle_controller.laws.law import SteeringCommand
-from needle_controller.model.arrays import Array
+from needle_controller.model.arrays import Array, Records
 from needle_controller.model.kinematics import PITCH, ROLL, X
 from needle_controller.observers.estimator import Estimate, Hypotheses
 from needle_core.compiled import compiled
-
-Records = npt.NDArray[np.void]
+from needle_core.errors import OutOfBoundsError, UserError
 
 _SMALLEST_LAG = 1e-6
 _USUAL_LAG = 0.008
 _USUAL_PLAY = math.radians(40.0)
+_DEPTH_TOLERANCE = 1e-6
 
 
 class RollLawSettings(NamedTuple):
@@ -94,6 +96,47 @@ class RollLawSettings(NamedTuple):
     smallest_weight: float = 0.02
 
 
+def check_flips(depths: Sequence[float], end: float) -> None:
+    """Check that flips come in increasing order, above 0 and before the end of steering.
+
+    Parameters
+    ----------
+    depths : sequence of float
+        Insertion depths of the flips [m].
+    end : float
+        Insertion at which steering ends [m].
+
+    Raises
+    ------
+    UserError
+        Depths that are not above 0 or not increasing, or a flip at the end or beyond.
+    """
+    before = 0.0
+    for number, depth in enumerate(depths, start=1):
+        if depth <= before:
+            bound = f"> {before:g} m" + (", the flip before it" if number > 1 else "")
+            raise UserError(f"flip {number} at {depth:g} m, expected {bound}")
+        before = depth
+    if depths and not before < end:
+        raise OutOfBoundsError(f"flip {len(depths)}", before, 0.0, end, "m")
+
+
+def bend_sign(depths: Sequence[float], insertion: float) -> float:
+    """Return the desired sign of cos(roll), +1 or -1, at an insertion; 0 without flips.
+
+    Parameters
+    ----------
+    depths : sequence of float
+        Insertion depths of the flips [m].
+    insertion : float
+        Insertion depth [m]; at the depth of a flip, within 1 um, the sign is that after the flip.
+    """
+    if not depths:
+        return 0.0
+    done = sum(depth <= insertion + _DEPTH_TOLERANCE for depth in depths)
+    return 1.0 if done % 2 == 0 else -1.0
+
+
 class RollLaw:
     """Turns the base to the roll that leads the needle to the plane.
 
@@ -119,19 +162,9 @@ class RollLaw:
             the nearer one. A change of sign is a turn by pi - 2 roll, which preserves the component
             of the curvature normal to the plane.
         """
-        known, s = hypotheses_of(estimate), estimate.linearized
-        turn, desired = roll_turn(
-            float(s[0]),
-            float(s[1]),
-            known.uncertainty,
-            known.torsions,
-            known.base,
-            known.wound,
-            float(bend_sign),
-            self.settings,
-        )
+        turn, desired = roll_turn(*hypotheses_of(estimate), float(bend_sign), self.settings)
         length = self.settings.step_length
-        return SteeringCommand((desired - float(s[2])) / length, turn / length)
+        return SteeringCommand((desired - float(estimate.linearized[2])) / length, turn / length)
 
 
 def hypotheses_of(estimate: Estimate) -> Hypotheses:
@@ -141,35 +174,26 @@ def hypotheses_of(estimate: Estimate) -> Hypotheses:
     """
     if estimate.hypotheses is not None:
         return estimate.hypotheses
-    only = np.zeros(1, TORSION)
+    only, mean = np.zeros(1, TORSION), np.zeros(1, ESTIMATE)[0]
     only["roll"], only["curvature"] = estimate.coordinates[ROLL], estimate.curvature
     only["agreement"] = only["weight"] = only["gain"] = 1.0
-    covariance, cosine = estimate.covariance, math.cos(float(estimate.coordinates[PITCH]))
+    p, cosine = estimate.covariance, math.cos(float(estimate.coordinates[PITCH]))
+    mean["coordinates"], mean["linearized"] = estimate.coordinates, estimate.linearized
+    mean["curvature"] = estimate.curvature
     # d sin(pitch) = cos(pitch) dpitch
-    uncertainty = np.array(
-        [covariance[X, X], covariance[X, PITCH] * cosine, covariance[PITCH, PITCH] * cosine**2]
-    )
-    return Hypotheses(only, 0.0, 0.0, uncertainty)
+    mean["uncertainty"] = p[X, X], p[X, PITCH] * cosine, p[PITCH, PITCH] * cosine**2
+    return Hypotheses(mean, only)
 
 
 @compiled
 def roll_turn(
-    x: float,
-    sin_pitch: float,
-    uncertainty: Array,
-    torsions: Records,
-    base: float,
-    wound: float,
-    bend_sign: float,
-    settings: RollLawSettings,
+    estimate: Any, torsions: Records, bend_sign: float, settings: RollLawSettings
 ) -> tuple[float, float]:
     """Return the rotation of the base over the next step [rad] and the desired s3 [1/m].
 
     Parameters
     ----------
-    x, sin_pitch : float
-        Distance from the plane [m] and sine of the pitch, over all hypotheses.
-    uncertainty, torsions, base, wound :
+    estimate, torsions : ESTIMATE, ndarray of TORSION
         See `Hypotheses`.
     bend_sign : float
         Desired sign of cos(roll); 0 for either.
@@ -178,18 +202,19 @@ def roll_turn(
     """
     limit = settings.max_rotation_per_length * settings.step_length
     least = settings.smallest_weight * torsions["weight"].max()
+    x, sin_pitch = estimate.linearized[0], estimate.linearized[1]
     turns = weights = s3_mean = 0.0
     for k in range(torsions.size):
         t = torsions[k]
         if t.weight < least or t.weight == 0.0:
             continue
-        s3, sine = desired_bend(x, sin_pitch, uncertainty, t, settings)
-        tip_turn = nearest_turn(t.roll, sine, bend_sign, wound, settings.max_winding)
+        s3, sine = desired_bend(x, sin_pitch, estimate.uncertainty, t, settings)
+        tip_turn = nearest_turn(t.roll, sine, bend_sign, estimate.wound, settings.max_winding)
         dead_band = settings.far_dead_band if abs(x) > settings.near else settings.near_dead_band
         dead_band += settings.scatter_dead_band * (1.0 - t.agreement)
         if abs(tip_turn) < dead_band:
             tip_turn = 0.0
-        rotation = base_turn(t, tip_turn, base, settings.step_length)
+        rotation = base_turn(t, tip_turn, estimate.base, settings.step_length)
         turns += t.weight * min(max(rotation, -settings.largest_turn), settings.largest_turn)
         s3_mean += t.weight * s3
         weights += t.weight

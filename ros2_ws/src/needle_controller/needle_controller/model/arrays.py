@@ -1,4 +1,4 @@
-"""The array type of the package."""
+"""The array types of the package."""
 
 from __future__ import annotations
 
@@ -8,3 +8,4 @@ import numpy as np
 import numpy.typing as npt
 
 Array: TypeAlias = npt.NDArray[np.float64]
+Records: TypeAlias = npt.NDArray[np.void]

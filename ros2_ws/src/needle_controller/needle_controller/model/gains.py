@@ -123,11 +123,8 @@ def sampled_observer_gain(
     """
     if length == 0.0:
         return 0.0, 0.0, 0.0
-    q1, q2, q3 = (
-        -np.expm1(poles[0] * length),
-        -np.expm1(poles[1] * length),
-        -np.expm1(poles[2] * length),
-    )
+    q = -np.expm1(poles * length)
+    q1, q2, q3 = q[0], q[1], q[2]
     e1 = (q1 + q2 + q3).real
     e2 = (q1 * q2 + q1 * q3 + q2 * q3).real
     e3 = (q1 * q2 * q3).real

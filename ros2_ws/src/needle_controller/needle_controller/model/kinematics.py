@@ -103,11 +103,9 @@ def angle_axes(angles: npt.ArrayLike) -> Array:
         Columns are the unit axes of yaw, pitch and roll.
     """
     angles = np.asarray(angles, dtype=float)
-    yaw, pitch = angles[..., 0], angles[..., 1]
+    yaw = angles[..., 0]
     one, zero = np.ones_like(yaw), np.zeros_like(yaw)
     about_yaw = np.stack([one, zero, zero], axis=-1)
     about_pitch = np.stack([zero, np.cos(yaw), np.sin(yaw)], axis=-1)
-    heading = np.stack(
-        [np.sin(pitch), -np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch)], axis=-1
-    )
+    heading = rotation_from_angles(angles)[..., 2]
     return np.stack([about_yaw, about_pitch, heading], axis=-1)

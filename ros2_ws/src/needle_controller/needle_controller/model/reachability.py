@@ -17,7 +17,6 @@ every law.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -31,53 +30,6 @@ LARGEST_PITCH = math.radians(80.0)
 """Largest pitch along the path: beyond it the coordinates (3) fail; no needle should go there."""
 SHORTEST_CHECKED_DEPTH = 0.12
 """Depth of the insertions of [KC09] IV-B [m]; shorter runs count as parts of one."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Reachability:
-    """Result for a plane or a point.
-
-    Attributes
-    ----------
-    reachable : ndarray of bool, shape (...)
-        Whether the needle can be there at the final insertion.
-    depth : ndarray, shape (...)
-        Smallest insertion at which it can be there [m].
-    """
-
-    reachable: npt.NDArray[np.bool_]
-    depth: Array
-
-
-def reachability(
-    reduced: npt.ArrayLike,
-    curvature: npt.ArrayLike,
-    *,
-    insertion: npt.ArrayLike,
-    end: npt.ArrayLike,
-    tolerance: float = 0.0,
-) -> Reachability:
-    """Return whether the plane can be reached within the remaining insertion.
-
-    Parameters
-    ----------
-    reduced : array_like, shape (..., 3)
-        x [m], pitch, roll [rad]; the roll does not matter.
-    curvature : array_like, shape (...)
-        kappa [1/m].
-    insertion, end : array_like, shape (...)
-        Present and final insertion [m].
-    tolerance : float
-        Distance from the plane that counts as in it [m].
-
-    Returns
-    -------
-    Reachability
-        Whether it can, and the smallest insertion at which it can.
-    """
-    insertion = np.asarray(insertion, dtype=float)
-    depth = insertion + least_insertion(reduced, curvature, tolerance=tolerance)
-    return Reachability(np.asarray(depth <= np.asarray(end, dtype=float)), depth)
 
 
 def least_insertion(
@@ -146,15 +98,13 @@ def check_plane(plane: TargetPlane, curvature: float, depth: float) -> None:
         )
 
 
-def point_reachability(
-    target: npt.ArrayLike,
-    curvature: npt.ArrayLike,
-    *,
-    insertion: npt.ArrayLike,
-    end: npt.ArrayLike,
-    tolerance: float = 0.0,
-) -> Reachability:
-    """Return whether a point can be reached within the remaining insertion.
+def least_insertion_to_point(
+    target: npt.ArrayLike, curvature: npt.ArrayLike, *, tolerance: float = 0.0
+) -> Array:
+    """Return the least insertion from a tip to a point, shape (...) [m]; NaN if out of reach.
+
+    A point next to or behind the tip, or one for which the needle would have to turn by more than
+    `LARGEST_PITCH`, counts as out of reach.
 
     Parameters
     ----------
@@ -162,29 +112,8 @@ def point_reachability(
         Point in the tip's frame [m].
     curvature : array_like, shape (...)
         kappa [1/m].
-    insertion, end : array_like, shape (...)
-        Present insertion, and the one at which steering ends at the latest [m].
     tolerance : float
         Distance at which the point counts as reached, small compared with 1 / kappa [m].
-
-    Returns
-    -------
-    Reachability
-        Whether it can, and the least insertion at which it can; NaN where it never can.
-    """
-    depth = np.asarray(insertion, dtype=float) + least_insertion_to_point(
-        target, curvature, tolerance=tolerance
-    )
-    return Reachability(np.asarray(depth <= np.asarray(end, dtype=float) + tolerance), depth)
-
-
-def least_insertion_to_point(
-    target: npt.ArrayLike, curvature: npt.ArrayLike, *, tolerance: float = 0.0
-) -> Array:
-    """Return the least insertion from a tip to a point, shape (...) [m]; NaN if out of reach.
-
-    A point next to or behind the tip, or one for which the needle would have to turn by more than
-    `LARGEST_PITCH`, counts as out of reach. Parameters as for `point_reachability`.
     """
     target = np.asarray(target, dtype=float)
     radius = 1.0 / np.asarray(curvature, dtype=float)

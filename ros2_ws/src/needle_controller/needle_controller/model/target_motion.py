@@ -55,7 +55,7 @@ class TargetMotion:
     def __init__(self) -> None:
         self._times: list[float] = []
         self._points: list[Array] = []
-        self._motion: _Motion | None = None
+        self._models: tuple[Array, Array] | None = None
 
     @property
     def last(self) -> Array:
@@ -84,7 +84,8 @@ class TargetMotion:
             Observed positions [m].
         """
         if self._times and time <= self._times[-1]:
-            self.reset()
+            self._times.clear()
+            self._points.clear()
         # Limit the number of samples in the window by replacing the last one.
         spacing = WINDOW / _MOST_SAMPLES
         if len(self._times) > 1 and time - self._times[-2] < spacing:
@@ -93,13 +94,7 @@ class TargetMotion:
         self._points.append(np.array(points, dtype=float))
         while self._times[0] < time - WINDOW:
             del self._times[0], self._points[0]
-        self._motion = None
-
-    def reset(self) -> None:
-        """Discard all observations."""
-        self._times.clear()
-        self._points.clear()
-        self._motion = None
+        self._models = None
 
     def at(self, time: npt.ArrayLike) -> Array:
         """Return the expected position of the target, shape (..., 3) [m].
@@ -109,38 +104,30 @@ class TargetMotion:
         time : array_like, shape (...)
             Time for each target [s].
         """
-        if self._motion is None:
-            self._motion = _Motion(np.array(self._times), np.array(self._points))
-        return self._motion.at(np.asarray(time, dtype=float))
+        shape = self.last.shape
+        if self._models is None:
+            points = np.reshape(self._points, (len(self._times), -1, 3))
+            self._models = _models_of_all(np.array(self._times) - self.last_time, points)
+        rates, coefficients = self._models
+        ahead = np.broadcast_to(np.asarray(time, dtype=float) - self.last_time, shape[:-1])
+        moved = np.einsum("hnt,hntc->nc", _terms(ahead.reshape(-1), rates), coefficients)
+        return np.asarray(self.last + moved.reshape(shape))
 
 
-class _Motion:
-    """Models of targets that were observed at times (K,) [s] at points (K, ..., 3) [m].
+def _models_of_all(since: Array, points: Array) -> tuple[Array, Array]:
+    """Return rates (H, N) [Hz] and coefficients (H, N, T, 3), times the weight of each model.
 
-    Each model has a rate (H, N) [Hz] and coefficients (H, N, T, 3), times its weight. The random
-    walk has no coefficients, since all positions are relative to the last one.
+    The targets were observed `since` (K,) [s] at points (K, N, 3) [m]. The random walk and targets
+    at rest need no coefficients, since all positions are relative to the last one.
     """
-
-    def __init__(self, times: Array, points: Array) -> None:
-        self._shape = points.shape[1:-1]
-        self._end = times[-1]
-        self._last = points[-1].reshape(-1, 3)
-        samples = np.moveaxis(points.reshape(len(times), -1, 3) - self._last, 0, 1)
-        moving = np.any(samples != 0.0, axis=(1, 2))
-        needles = len(samples)
-        self._rates, self._coefficients = np.zeros((1, needles)), np.zeros((1, needles, _TERMS, 3))
-        since = times - self._end
-        if -since[0] >= SHORTEST and np.any(moving):
-            rates, coefficients = _weighted_models(since, samples[moving])
-            self._rates = np.zeros((len(rates), needles))
-            self._coefficients = np.zeros((len(rates), needles, _TERMS, 3))
-            self._rates[:, moving], self._coefficients[:, moving] = rates, coefficients
-
-    def at(self, time: Array) -> Array:
-        """Return the expected positions of the targets [m]."""
-        ahead = np.broadcast_to(time - self._end, self._shape).reshape(-1)
-        moved = np.einsum("hnt,hntc->nc", _terms(ahead, self._rates), self._coefficients)
-        return np.asarray((self._last + moved).reshape(*self._shape, 3))
+    samples = np.moveaxis(points - points[-1], 0, 1)
+    moving = np.any(samples != 0.0, axis=(1, 2))
+    rates, coefficients = np.zeros((0, len(samples))), np.zeros((0, len(samples), _TERMS, 3))
+    if -since[0] >= SHORTEST and np.any(moving):
+        known = _weighted_models(since, samples[moving])
+        rates, coefficients = (np.zeros((len(m), len(samples), *m.shape[2:])) for m in known)
+        rates[:, moving], coefficients[:, moving] = known
+    return rates, coefficients
 
 
 def _weighted_models(since: Array, samples: Array) -> tuple[Array, Array]:

@@ -98,8 +98,8 @@ def plane_from_pose(
     return plane
 
 
-def point_from_message(frame_id: str, position: npt.ArrayLike) -> Array:
-    """Return a target point, shape (3,), of `rig` [m].
+def point_from_message(name: str, frame_id: str, position: npt.ArrayLike) -> Array:
+    """Return a received point, shape (3,), of `rig` [m]; `name` is for errors.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def point_from_message(frame_id: str, position: npt.ArrayLike) -> Array:
     """
     point = np.asarray(position, dtype=float)
     if frame_id != RIG:
-        raise UserError(f"target_point is given in frame '{frame_id}', expected '{RIG}'")
+        raise UserError(f"{name} is given in frame '{frame_id}', expected '{RIG}'")
     if not np.all(np.isfinite(point)):
-        raise UserError(f"target_point is not finite: {point}")
+        raise UserError(f"{name} is not finite: {point}")
     return point

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -13,26 +13,19 @@ from needle_controller.model.feedback_linearization import linearized_from_reduc
 from needle_controller.model.kinematics import REDUCED, angles_from_rotation, rotation_from_angles
 
 
-@dataclasses.dataclass(frozen=True)
-class Hypotheses:
-    """Estimate over several hypotheses: the part that the laws need.
+class Hypotheses(NamedTuple):
+    """Estimate over several hypotheses, as the compiled laws read it.
 
     Attributes
     ----------
+    mean : void
+        Mean over all hypotheses, `filter.records.ESTIMATE`.
     torsions : ndarray, shape (K,)
         Mean over the hypotheses of each torsion, `filter.records.TORSION`.
-    base : float
-        Rotation of the base since the start [rad], to which the torsions' angles refer, too.
-    wound : float
-        Position of the rotation joint [rad].
-    uncertainty : ndarray, shape (3,)
-        Variance of x [m^2], its covariance with sin(pitch) [m], variance of sin(pitch).
     """
 
+    mean: np.void
     torsions: npt.NDArray[np.void]
-    base: float
-    wound: float
-    uncertainty: Array
 
 
 @dataclasses.dataclass(frozen=True)

@@ -63,8 +63,8 @@ class Obstacles:
 
     Parameters
     ----------
-    obstacles : sequence of Obstacle
-        Obstacles in `rig`; error messages number them from 1.
+    obstacles : sequence of Obstacle, or array_like, shape (N, 7)
+        Obstacles in `rig`, or the `table`; error messages number them from 1.
 
     Attributes
     ----------
@@ -77,17 +77,15 @@ class Obstacles:
         More than `MOST_OBSTACLES`, or a number that is not finite or out of bounds.
     """
 
-    def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
+    def __init__(self, obstacles: Sequence[Obstacle] | Array = ()) -> None:
         if len(obstacles) > MOST_OBSTACLES:
             raise UserError(f"{len(obstacles)} obstacles, limit {MOST_OBSTACLES}")
-        rows = [
-            [float(number) for number in (*one.start, *one.end, one.radius)] for one in obstacles
-        ]
-        for number, row in enumerate(rows, start=1):
+        rows = [np.hstack(one) for one in obstacles]
+        self.table: Array = np.array(rows, dtype=float).reshape(-1, 7)
+        for number, row in enumerate(self.table.tolist(), start=1):
             for axis, value in zip("xyzxyz", row[:6], strict=True):
                 check_bounds(f"{axis} of obstacle {number}", value, -FARTHEST, FARTHEST, "m")
             check_bounds(f"radius of obstacle {number}", row[6], 1e-5, LARGEST_RADIUS, "m")
-        self.table: Array = np.array(rows, dtype=float).reshape(-1, 7)
 
     def __len__(self) -> int:
         """Return the number of obstacles."""

@@ -9,12 +9,14 @@ would turn the bevel unnecessarily.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.planning.flood_fill import may_have_path
 from needle_controller.planning.legs import MOST_POINTS, leg_towards, trace_leg, truncated
 from needle_controller.planning.obstacles import Obstacles
@@ -25,7 +27,12 @@ from needle_controller.planning.path_evaluation import (
     PoseUncertainty,
     evaluate_path,
 )
-from needle_controller.planning.path_search import QUICK_STARTS, initial_legs, optimize_legs
+from needle_controller.planning.path_search import (
+    QUICK_STARTS,
+    THOROUGH_STARTS,
+    initial_legs,
+    optimize_legs,
+)
 from needle_core.settings.bounds import check_bounds
 
 _BETTER_BY = 0.004
@@ -34,6 +41,9 @@ _NEAR_SHARE = 0.5
 """Share of the tracking error's clearance that may be missing just ahead of the needle."""
 _SHORTEST_LEG = 0.0005
 """Remaining length at which a leg is complete [m]."""
+_ENTRY_OFFSETS = (0.001, 0.002, 0.004, 0.007, 0.011, 0.016)
+"""Radii of the rings on which other entries are tried [m]."""
+_ENTRIES_PER_RING = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +108,22 @@ class TipState:
     def pose(self) -> Array:
         """Pose for compiled code, shape (3, 4)."""
         return np.hstack([self.rotation, np.reshape(self.position, (3, 1))])
+
+
+def entry_state(curvature: float, *, rotation: float = 0.0, heading_std: float = 0.0) -> TipState:
+    """Return a needle's tip at the rig's entry point.
+
+    Parameters
+    ----------
+    curvature : float
+        kappa [1/m].
+    rotation : float
+        Rotation of the base [rad].
+    heading_std : float
+        Standard deviation of the heading [rad].
+    """
+    turned = rotation_from_angles([0.0, 0.0, rotation])
+    return TipState(np.zeros(3), turned, curvature, heading_std=heading_std)
 
 
 class PathPlanner:
@@ -165,6 +191,60 @@ class PathPlanner:
         # Use the whole curvature; a share of it was reserved for this case.
         problem = problem._replace(curvature=tip.curvature)
         return self._best(problem, insertion, previous, starts)
+
+    def first_path(
+        self, entry: TipState, target: npt.ArrayLike, obstacles: Obstacles
+    ) -> NeedlePath | str:
+        """Return the path of a needle that is not yet inserted, or the reason why there is none.
+
+        If the quick search finds no path and the flood fill does not rule one out, the thorough
+        search follows. The reason distinguishes a proof ("no path is clear") from a failed search
+        ("was found clear"), and names a nearby entry with a path, if any.
+
+        Parameters
+        ----------
+        entry : TipState
+            The needle's tip.
+        target : array_like, shape (3,)
+            Target in `rig` [m].
+        obstacles : Obstacles
+            Obstacles to avoid.
+        """
+        path = self.path(entry, target, obstacles)
+        if path is not None:
+            return path
+        clear = self.settings.least_clearance
+        for name, point, minimum in (
+            ("target point", target, clear - self.settings.goal_tolerance),
+            ("entry", entry.position, clear),
+        ):
+            if (distance := obstacles.clearance(point)) < minimum:
+                return f"the {name} is {distance:.4g} m from an obstacle, minimum {minimum:.4g} m"
+        possible = self.may_have_path(entry, target, obstacles)
+        path = self.path(entry, target, obstacles, starts=THOROUGH_STARTS) if possible else None
+        if path is not None:
+            return path
+        is_clear = "was found clear" if possible else "is clear"
+        reason = f"no path to the target point {is_clear} of the {len(obstacles)} obstacles"
+        nearest = self.nearest_entry(entry, target, obstacles)
+        if nearest is None:
+            return f"{reason}, nor from any entry up to {_ENTRY_OFFSETS[-1]:.4g} m from it"
+        x, y = nearest
+        return f"{reason}; there is one from an entry at ({x:.4g}, {y:.4g}) m instead of (0, 0)"
+
+    def nearest_entry(
+        self, entry: TipState, target: npt.ArrayLike, obstacles: Obstacles
+    ) -> Array | None:
+        """Return the nearest entry (x, y) [m], on rings around a given one, with a path.
+
+        The parameters are those of `first_path`. Heading and rotation stay the same.
+        """
+        for offset, k in itertools.product(_ENTRY_OFFSETS, range(_ENTRIES_PER_RING)):
+            angle = 2.0 * math.pi * k / _ENTRIES_PER_RING
+            moved = entry.position + offset * np.array([math.cos(angle), math.sin(angle), 0.0])
+            if self.path(dataclasses.replace(entry, position=moved), target, obstacles) is not None:
+                return np.asarray(moved[:2])
+        return None
 
     def _best(
         self, problem: PathProblem, insertion: float, previous: NeedlePath | None, starts: int

@@ -13,12 +13,11 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import PITCH, YAW, X
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate
-from needle_controller.planning.entry import entry_state, first_path
-from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.obstacles import Obstacles
 from needle_controller.planning.path_evaluation import PathSettings
-from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
+from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState, entry_state
 from needle_controller.presets.own_parts import OwnPart, own_part
-from needle_controller.presets.point_steering import prompt_point_law
+from needle_controller.presets.point_steering import point_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 _VIA_POINTS = "via points x, y, z in rig [m], the target last"
@@ -111,12 +110,6 @@ def path_planner(settings: SteeringSettings) -> PathPlanner:
     )
 
 
-def configured_obstacles(settings: SteeringSettings) -> Obstacles:
-    """Return the obstacles of the settings; raises UserError as `Obstacles` does."""
-    rows = np.reshape(settings.obstacles, (-1, 7))
-    return Obstacles([Obstacle(row[:3], row[3:6], row[6]) for row in rows])
-
-
 class PathSteering:
     """Steers one needle around obstacles.
 
@@ -136,10 +129,9 @@ class PathSteering:
     def __init__(self, settings: SteeringSettings) -> None:
         self._settings = settings
         self._planner = path_planner(settings)
-        self._own = None
-        if settings.planner:
-            self._own = OwnPlanner(checked_planner(settings.planner), settings)
-        self._law = prompt_point_law(settings)
+        name = settings.planner
+        self._own = OwnPlanner(checked_planner(name), settings) if name else None
+        self._law = point_law(settings, is_prompt=True)
         self.path: NeedlePath | None = None
         self.last_route: Route | None = None
 
@@ -166,7 +158,7 @@ class PathSteering:
                 f"planner {self._own.part.name} finds no path to the target point past "
                 f"{len(obstacles)} obstacles"
             )
-        found = first_path(self._planner, entry, target, obstacles)
+        found = self._planner.first_path(entry, target, obstacles)
         self.path = None if isinstance(found, str) else found
         return found if isinstance(found, str) else ""
 
@@ -193,8 +185,9 @@ class PathSteering:
         insertion : float
             Present insertion [m].
         """
-        route = self.route(tip_state(estimate, plane), target, obstacles, insertion)
-        self.last_route = route
+        route = self.last_route = self._route(
+            tip_state(estimate, plane), target, obstacles, insertion
+        )
         if route is None:
             return None
         command = self._law(estimate, plane.from_rig(route.aim))
@@ -202,10 +195,9 @@ class PathSteering:
             return command
         return SteeringCommand(command.virtual_input, command.rotation_rate, route.length)
 
-    def route(
+    def _route(
         self, tip: TipState, target: Array, obstacles: Obstacles, insertion: float
     ) -> Route | None:
-        """Return the route from a tip; None if no path is clear; see `command`."""
         if self._own is not None:
             return self._own.route(tip, target, obstacles)
         path = self.path = self._planner.path(

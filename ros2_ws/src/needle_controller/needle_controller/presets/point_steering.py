@@ -13,7 +13,7 @@ from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import WINDOW, TargetMotion
 from needle_controller.observers.estimator import Estimate
-from needle_controller.presets.own_law import OwnLaw, checked_law
+from needle_controller.presets.own_controllers import OwnLaw, checked_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 _ITERATIONS = 4
@@ -139,23 +139,16 @@ class PointSteering(ArrivalPrediction):
         return self._law(estimate, from_rig(aim), rotation_left)
 
 
-def point_law(settings: SteeringSettings) -> LawToPoint:
-    """Return the law for points of checked settings."""
+def point_law(settings: SteeringSettings, *, is_prompt: bool = False) -> LawToPoint:
+    """Return the law for points of checked settings.
+
+    A prompt law turns the bevel immediately, as planned paths require; a law of another package
+    decides for itself.
+    """
     if settings.law:
         return OwnLaw(checked_law(settings.law), settings).to_point
-    return PointLaw(PointLawSettings(**settings.turning))
-
-
-def prompt_point_law(settings: SteeringSettings) -> LawToPoint:
-    """Return the law for points that turns the bevel immediately, as planned paths require."""
-    if settings.law:
-        return point_law(settings)
-    return PointLaw(
-        PointLawSettings(
-            **settings.turning,
-            reserve=1.0,
-            last_turn=0.0,
-            last_turns_from=settings.step_length,
-            dead_band=0.05,
-        )
-    )
+    turns = PointLawSettings(**settings.turning)
+    if is_prompt:
+        length = settings.step_length
+        turns = turns._replace(reserve=1.0, last_turn=0.0, last_turns_from=length, dead_band=0.05)
+    return PointLaw(turns)

@@ -7,24 +7,26 @@ import numpy.typing as npt
 
 from needle_controller.filter.filter_settings import BOUNDED_NOISE, NORMAL_NOISE, FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
-from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.laws.law import LinearizingGains, LinearizingLaw, OpenLoopLaw, StepLaw
-from needle_controller.laws.roll_law import RollLaw, RollLawSettings
-from needle_controller.model.gains import Gains
+from needle_controller.laws.roll_law import RollLaw, RollLawSettings, bend_sign
 from needle_controller.observers.estimator import Estimator
 from needle_controller.observers.luenberger import LuenbergerObserver, ObserverSettings
-from needle_controller.presets.own_estimator import OwnEstimator, checked_estimator
-from needle_controller.presets.own_law import OwnLaw, checked_law
+from needle_controller.presets.own_controllers import (
+    OwnEstimator,
+    OwnLaw,
+    checked_estimator,
+    checked_law,
+)
 from needle_controller.presets.steering_settings import SteeringSettings
 
 
-def make_law(settings: SteeringSettings, gains: Gains) -> LinearizingLaw | OpenLoopLaw:
-    """Return the law of preset `paper`, (7) and (10) with these gains, or that of `open_loop`."""
+def make_law(settings: SteeringSettings) -> LinearizingLaw | OpenLoopLaw:
+    """Return the law of preset `paper`, (7) and (10), or that of `open_loop`."""
     if settings.preset == "open_loop":
         return OpenLoopLaw()
     return LinearizingLaw(
         LinearizingGains(
-            feedback=gains.feedback,
+            feedback=settings.gains().feedback,
             step_length=settings.step_length,
             demand_margin=settings.demand_margin,
             max_rotation_per_length=settings.max_rotation_per_length,
@@ -43,12 +45,12 @@ def filter_settings(settings: SteeringSettings) -> FilterSettings:
     )
 
 
-def observer_settings(settings: SteeringSettings, gains: Gains) -> ObserverSettings:
+def observer_settings(settings: SteeringSettings) -> ObserverSettings:
     """Return the observer settings of presets `paper` and `open_loop`."""
     return ObserverSettings(
         curvature=settings.curvature,
         saturation_margin=settings.saturation_margin,
-        poles=gains.observer_poles,
+        poles=settings.gains().observer_poles,
         process_noise=np.diag(settings.process_noise),
         measurement_std=settings.measurement_std,
     )
@@ -56,8 +58,8 @@ def observer_settings(settings: SteeringSettings, gains: Gains) -> ObserverSetti
 
 def roll_law(settings: SteeringSettings) -> StepLaw:
     """Return the law of preset `best`; without flips the needle bends to the nearer side."""
-    law, plan = RollLaw(RollLawSettings(**settings.turning)), FlipPlan(settings.flip_depths)
-    return lambda estimate, insertion: law(estimate, plan.bend_sign(insertion))
+    law, flips = RollLaw(RollLawSettings(**settings.turning)), settings.flip_depths
+    return lambda estimate, insertion: law(estimate, bend_sign(flips, insertion))
 
 
 def make_controller(
@@ -85,22 +87,15 @@ def make_controller(
     OwnPartError
         An invalid estimator or law of another package.
     """
-    estimator, law = _of_preset(settings, initial_rotation, entry)
+    estimator: Estimator
     if settings.estimator:
         part = checked_estimator(settings.estimator)
         rng = np.random.default_rng([settings.seed, number])
         estimator = OwnEstimator(part, settings, initial_rotation, entry, rng)
-    if settings.law:
-        law = OwnLaw(checked_law(settings.law), settings)
-    return estimator, law
-
-
-def _of_preset(
-    settings: SteeringSettings, initial_rotation: npt.ArrayLike, entry: npt.ArrayLike | None
-) -> tuple[Estimator, StepLaw]:
-    if settings.preset == "best":
+    elif settings.preset == "best":
         estimator = HypothesisFilter(filter_settings(settings), initial_rotation, entry)
-        return estimator, roll_law(settings)
-    gains = settings.gains()
-    observer = LuenbergerObserver(observer_settings(settings, gains), initial_rotation)
-    return observer, make_law(settings, gains)
+    else:
+        estimator = LuenbergerObserver(observer_settings(settings), initial_rotation)
+    if settings.law:
+        return estimator, OwnLaw(checked_law(settings.law), settings)
+    return estimator, roll_law(settings) if settings.preset == "best" else make_law(settings)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.laws.flip_plan import FlipPlan
+from needle_controller.laws.roll_law import check_flips
 from needle_controller.model.arrays import Array
 from needle_controller.model.gains import Gains, design_gains
 from needle_controller.model.reachability import check_plane, check_point
@@ -21,10 +21,6 @@ from needle_core.settings.parameter_fields import check_fields, fixed_parameter,
 ONE_SIDED_PRESETS = ("paper", "open_loop")
 """Presets whose coordinates are limited to roll +-90 deg: they cannot steer to a point."""
 PRESETS = ("best", *ONE_SIDED_PRESETS)
-INSERTIONS = ("stepwise", "continuous")
-TIP_NOISES = ("bounded", "normal")
-TIP_COVARIANCES = ("configured", "from_tip_pose")
-"""Sources of a tip's covariance."""
 _HEADING_NEEDS = "tip_covariance from_tip_pose, and preset best or an own estimator"
 PAPER_NOISE: dict[str, Any] = {
     "tip_covariance": "configured",
@@ -62,12 +58,8 @@ class SteeringSettings:
     planner: str = fixed_parameter(
         "", "-", "Planner of paths to a point, likewise (group needle_controller.planners)."
     )
-    seed: int = fixed_parameter(
-        0, "-", "Seed of an estimator of another package; presets use none.", 0, 2**31 - 1
-    )
-    curvature: float = parameter(
-        1.0 / 0.122, "1/m", "Curvature of the needle's path in the tissue.", 0.1, 100.0
-    )
+    seed: int = fixed_parameter(0, "-", "Seed of another package's estimator.", 0, 2**31 - 1)
+    curvature: float = parameter(1 / 0.122, "1/m", "Curvature of the needle's path.", 0.1, 100.0)
     needle_diameter: float = fixed_parameter(
         0.0007, "m", "Diameter of the needle, for the distance to obstacles.", 0.2e-3, 3e-3
     )
@@ -105,7 +97,7 @@ class SteeringSettings:
         "-",
         "stepwise: the needle rests after each step until its tip is measured; continuous: it "
         "advances during the hold, and every tip updates the path ahead.",
-        choices=INSERTIONS,
+        choices=("stepwise", "continuous"),
     )
     horizon: float = parameter(
         0.002,
@@ -117,11 +109,7 @@ class SteeringSettings:
     )
     nominal_speed: float = parameter(0.002, "m/s", "Insertion speed at speed scale 1.", 1e-5, 0.05)
     max_rotation_per_length: float = parameter(
-        math.radians(30.0) / 0.001,
-        "rad/m",
-        "Maximum rotation of the base per inserted length.",
-        0.0,
-        1000.0,
+        math.radians(30.0) / 0.001, "rad/m", "Maximum base rotation per inserted length.", 0.0, 1e3
     )
     max_winding: float = parameter(
         6.0 * math.pi,
@@ -148,7 +136,7 @@ class SteeringSettings:
         "from_tip_pose: the covariance of the needle/tip_pose with the tip's stamp, plus "
         "measurement_std squared; a tip without one is rejected. configured: the noise of "
         "tip_noise, for a source that only publishes needle/tip.",
-        choices=TIP_COVARIANCES,
+        choices=("configured", "from_tip_pose"),
     )
     measured_heading: bool = fixed_parameter(
         False,
@@ -157,11 +145,7 @@ class SteeringSettings:
         f"whose heading is that of the pre-bent end. Needs {_HEADING_NEEDS}.",
     )
     result_timeout: float = parameter(
-        10.0,
-        "s",
-        "Time without device/result until FAULT, while the device is at rest (monotonic clock).",
-        0.1,
-        600.0,
+        10.0, "s", "Time at rest without device/result until FAULT (monotonic clock).", 0.1, 600.0
     )
     tip_margin: float = parameter(
         0.004, "m", "Accepted distance of a measured tip from the needle's reach.", 0.0, 0.1
@@ -177,14 +161,10 @@ class SteeringSettings:
         "-",
         "Noise of each coordinate if tip_covariance is configured. bounded: errors up to "
         "tip_noise_bound (best uses this bound); normal: standard deviation measurement_std.",
-        choices=TIP_NOISES,
+        choices=("bounded", "normal"),
     )
     tip_noise_bound: float = parameter(
-        0.001,
-        "m",
-        "Maximum error of a measured tip coordinate if tip_noise is bounded.",
-        1e-6,
-        0.1,
+        0.001, "m", "Maximum error of a measured tip coordinate if tip_noise is bounded.", 1e-6, 0.1
     )
     flip_depths: tuple[float, ...] = parameter(
         (),
@@ -216,11 +196,7 @@ class SteeringSettings:
         0.11, "-", "Limits the estimate to s2^2 + (s3/curvature)^2 <= 1 - this value.", 1e-6, 0.9
     )
     demand_margin: float = parameter(
-        0.26,
-        "-",
-        "Limits the demanded state to s2^2 + (s3/curvature)^2 <= 1 - this value.",
-        1e-6,
-        0.9,
+        0.26, "-", "Limits the demanded state, as saturation_margin the estimate.", 1e-6, 0.9
     )
     entry_angle_std: float = parameter(
         math.radians(8.0),
@@ -247,7 +223,7 @@ class SteeringSettings:
             self.check_point(self.target_point)
         if len(self.obstacles) % 7:
             raise UserError(f"obstacles has {len(self.obstacles)} numbers, expected 7 for each")
-        FlipPlan(self.flip_depths).check_within(self.depth)
+        check_flips(self.flip_depths, self.depth)
         if self.flip_depths and self.law:
             raise UserError(f"flip_depths apply to the law of best only, not to law {self.law}")
         if self.flip_depths and self.preset in ONE_SIDED_PRESETS:

@@ -102,21 +102,14 @@ class StartReply:
 
 
 def next_step(
-    stamp_ns: int,
-    joints: JointSample,
-    command: SteeringCommand,
-    settings: SteeringSettings,
-    *,
-    slowly: bool,
+    joints: JointSample, command: SteeringCommand, settings: SteeringSettings, *, slowly: bool
 ) -> SendStep | None:
     """Return the next step; None if the needle has reached the depth or its target point.
 
     Parameters
     ----------
-    stamp_ns : int
-        Stamp of the tip that the step is computed from [ns].
     joints : JointSample
-        Joint positions at that tip's exposure.
+        Joint positions at the exposure of the tip that the step is computed from.
     command : SteeringCommand
         Output of the control law.
     settings : SteeringSettings
@@ -138,7 +131,7 @@ def next_step(
     if is_last:
         length = remaining
     return SendStep(
-        stamp_ns=stamp_ns,
+        stamp_ns=joints.stamp_ns,
         # The last step ends exactly at the depth: joints + length may differ in the last bit.
         insertion=end if is_last else joints.insertion + length,
         rotation=joints.rotation + float(command.rotation_rate) * length,

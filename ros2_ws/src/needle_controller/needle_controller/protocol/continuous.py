@@ -70,7 +70,7 @@ class PathAhead:
         slowly: bool,
     ) -> None:
         self._settings = settings
-        step = next_step(joints.stamp_ns, joints, command, settings, slowly=slowly)
+        step = next_step(joints, command, settings, slowly=slowly)
         self.is_done = step is None
         self.start = joints
         # End of the rotation; at the target, no motion is left.

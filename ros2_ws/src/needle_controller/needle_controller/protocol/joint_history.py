@@ -8,6 +8,9 @@ import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 
+from needle_core.errors import UserError
+from needle_core.messages import INSERTION_JOINT, ROTATION_JOINT, JointState
+
 CONFIRMED_BY = 5
 """Consecutive samples, consistent with one another, that replace the history after a jump."""
 LARGEST_GAP_NS = 1_000_000_000
@@ -15,6 +18,8 @@ LARGEST_GAP_NS = 1_000_000_000
 _MAX_INSERTION_SPEED, _MAX_ROTATION_SPEED = 0.05, 30.0
 """Speeds of a needle pushed by hand [m/s], and of a motor [rad/s]."""
 _INSERTION_NOISE, _ROTATION_NOISE = 2e-4, 0.1  # [m], [rad]
+_REST_INSERTION = 2e-6
+"""Largest change of the insertion at rest [m]."""
 _LONGEST_MOTION = 0.04
 """Longest duration of a motion between two samples [s]."""
 
@@ -46,6 +51,28 @@ class JointSample:
             abs(self.insertion - other.insertion) <= insertion
             and abs(self.rotation - other.rotation) <= rotation
         )
+
+    def is_at_rest(self, other: JointSample, rotation: float = math.inf) -> bool:
+        """Return True if the insertion is that of another sample, and the rotation nearly so."""
+        return self.is_near(other, _REST_INSERTION, rotation)
+
+
+def joint_sample(message: JointState, sent_ns: int) -> JointSample:
+    """Return the joint positions of a message that was sent at `sent_ns`.
+
+    Raises
+    ------
+    UserError
+        A joint is missing or not finite.
+    """
+    position = dict(zip(message.names, message.positions, strict=False))
+    missing = [name for name in (INSERTION_JOINT, ROTATION_JOINT) if name not in position]
+    if missing:
+        raise UserError(f"joint_states without {' and '.join(missing)}: {list(message.names)}")
+    insertion, rotation = position[INSERTION_JOINT], position[ROTATION_JOINT]
+    if not (math.isfinite(insertion) and math.isfinite(rotation)):
+        raise UserError(f"joint_states are not finite: {insertion} m, {rotation} rad")
+    return JointSample(message.stamp_ns, insertion, rotation, sent_ns)
 
 
 class SampleResult(enum.Enum):
@@ -96,8 +123,6 @@ class JointHistory:
 
     def add(self, sample: JointSample) -> SampleResult:
         """Add a sample if it is consistent with the last one."""
-        if not (math.isfinite(sample.insertion) and math.isfinite(sample.rotation)):
-            return SampleResult.REJECTED
         latest = self.latest
         if latest is None:
             self._samples.append(sample)

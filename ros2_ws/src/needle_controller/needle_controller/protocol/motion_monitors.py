@@ -10,8 +10,8 @@ from needle_controller.protocol.actions import Action, SendStep
 from needle_controller.protocol.joint_history import JointHistory, JointSample
 from needle_core.component import Log
 
-REST_INSERTION, REST_ROTATION = 2e-6, 1e-4
-"""Largest change of a joint at rest [m], [rad]."""
+_REST_ROTATION = 1e-4
+"""Largest change of the rotation at rest [rad]."""
 MAX_ABORTS_AT_REST = 10
 """Consecutive commands without motion after which the controller gives up."""
 MAX_UNFOLLOWED_STEPS = 3
@@ -84,7 +84,7 @@ class StepMonitor:
         if sample is None or sample.sent_ns < self._answered_ns:
             return StepOutcome.PENDING
         standing = self._standing
-        if standing and not sample.is_near(standing[0], REST_INSERTION, REST_ROTATION):
+        if standing and not sample.is_at_rest(standing[0], _REST_ROTATION):
             standing.clear()
         standing.append(sample)
         if len(standing) < _STANDSTILL_SAMPLES:
@@ -149,19 +149,18 @@ class RetractionMonitor:
         self._retracted = False
         self._deepest = 0.0
         self._recent: deque[float] = deque(maxlen=_MEDIAN_OF)
-        self._before: JointSample | None = None
-        self._after: JointSample | None = None
+        self._jump: tuple[JointSample, JointSample] | None = None
 
     @property
     def reason(self) -> str:
         """Reason to withdraw the needle before it is steered; empty if there is none."""
         if self._retracted:
             return "the needle was retracted: withdraw it first"
-        if self._before is not None and self._after is not None:
+        if self._jump is not None:
+            before, after = self._jump
             return (
-                f"joint_states jumped from {self._before.insertion:.4g} m, "
-                f"{self._before.rotation:.4g} rad to {self._after.insertion:.4g} m, "
-                f"{self._after.rotation:.4g} rad: withdraw the needle first"
+                f"joint_states jumped from {before.insertion:.4g} m, {before.rotation:.4g} rad to "
+                f"{after.insertion:.4g} m, {after.rotation:.4g} rad: withdraw the needle first"
             )
         return ""
 
@@ -170,7 +169,7 @@ class RetractionMonitor:
         self._deepest = insertion
         self._retracted = False
         self._recent.clear()
-        self._before = self._after = None
+        self._jump = None
 
     def update(self, insertion: float, *, out_below: float, tolerance: float) -> bool:
         """Add a sample; return whether the needle is being retracted.
@@ -189,7 +188,7 @@ class RetractionMonitor:
             return False
         here = statistics.median_low(self._recent)
         is_out = here <= out_below
-        if self._before is not None:
+        if self._jump is not None:
             if is_out:
                 self.reset(here)
             return False
@@ -216,9 +215,9 @@ class RetractionMonitor:
             Whether the joints are away from their last observed position.
         """
         self._recent.clear()
-        observed = self._before or before
+        observed = self._jump[0] if self._jump else before
         away = not after.is_near(observed, tolerance, _SAME_ROTATION)
-        self._before, self._after = (observed, after) if away else (None, None)
+        self._jump = (observed, after) if away else None
         return away
 
 
@@ -268,8 +267,4 @@ class Watchdog:
     def has_moved(self, latest: JointSample | None) -> bool:
         """Return whether the insertion has changed since the last call."""
         before, self._last_joints = self._last_joints, latest
-        return (
-            latest is not None
-            and before is not None
-            and abs(latest.insertion - before.insertion) > REST_INSERTION
-        )
+        return not (latest is None or before is None or latest.is_at_rest(before))

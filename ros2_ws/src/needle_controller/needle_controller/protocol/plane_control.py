@@ -5,23 +5,24 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from needle_controller.filter.bank import MERGE_EVERY
 from needle_controller.filter.records import NEAR
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_controller.model.reachability import Reachability, point_reachability, reachability
+from needle_controller.model.reachability import least_insertion, least_insertion_to_point
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate, Estimator
-from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.obstacles import Obstacles
 from needle_controller.presets.path_steering import (
     PathSteering,
     Route,
-    configured_obstacles,
     path_planner,
 )
 from needle_controller.presets.point_steering import PointSteering, point_law
@@ -36,7 +37,17 @@ LARGEST_START_ROLL = math.radians(80.0)
 HEADING_CORRELATION = 0.01
 """Inserted length over which measured headings count as one, because errors of the sensor's
 alignment and registration repeat [m]: harmless up to 10 mrad (60 needles each)."""
-_FAR_AWAY = Obstacles([Obstacle((0.5, 0.0, 0.01), (0.5, 0.0, 0.02), 0.001)])
+_FAR_AWAY = Obstacles(np.array([[0.5, 0.0, 0.01, 0.5, 0.0, 0.02, 0.001]]))
+
+
+class Reachability(NamedTuple):
+    """Whether plane or point can be reached, and the smallest insertion for that [m].
+
+    NaN if a point can never be reached.
+    """
+
+    reachable: bool
+    depth: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +104,7 @@ class PlaneControl:
         self._plane = settings.plane()
         self._points: PointSteering | None = None
         self.target_point = _configured_point(settings)
-        self.obstacles = configured_obstacles(settings)
+        self.obstacles = Obstacles(np.reshape(settings.obstacles, (-1, 7)))
         self._path = PathSteering(settings)
         self._estimator, self._law = _new_controller(settings, self._plane)
         self._joints: JointSample | None = None
@@ -160,7 +171,7 @@ class PlaneControl:
         if not settings.steers_to_points:
             self.target_point = None
         if settings.obstacles != self._settings.obstacles:
-            self.obstacles = configured_obstacles(settings)
+            self.obstacles = Obstacles(np.reshape(settings.obstacles, (-1, 7)))
         self._path = PathSteering(settings)
         self._settings = settings
         self._restart_point_steering()
@@ -194,7 +205,7 @@ class PlaneControl:
 
     def update(
         self,
-        tip: Array,
+        tip: npt.ArrayLike,
         joints: JointSample,
         covariance: TipCovariance | None = None,
         intermediate: Sequence[JointSample] = (),
@@ -203,7 +214,7 @@ class PlaneControl:
 
         Parameters
         ----------
-        tip : ndarray, shape (3,)
+        tip : array_like, shape (3,)
             The tip in `rig` [m].
         joints : JointSample
             Joint positions at its exposure.
@@ -297,11 +308,16 @@ class PlaneControl:
         return len(self.obstacles) > 0 or self._settings.planner != ""
 
     def _reach(self, estimate: Estimate, joints: JointSample) -> Reachability:
-        limits = {"insertion": joints.insertion, "end": self._settings.depth, "tolerance": NEAR}
+        curvature, end = estimate.curvature, self._settings.depth
         if self._points is None:
-            return reachability(estimate.reduced, estimate.curvature, **limits)
-        offset = self._plane.from_rig(self._points.aim) - estimate.position
-        return point_reachability(estimate.rotation.T @ offset, estimate.curvature, **limits)
+            needed = least_insertion(estimate.reduced, curvature, tolerance=NEAR)
+        else:
+            offset = self._plane.from_rig(self._points.aim) - estimate.position
+            ahead = estimate.rotation.T @ offset
+            needed = least_insertion_to_point(ahead, curvature, tolerance=NEAR)
+            end += NEAR
+        depth = joints.insertion + float(needed)
+        return Reachability(depth <= end, depth)
 
     def _miss_probability(self, estimate: Estimate) -> float | None:
         if self._points is None or estimate.miss is None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from needle_controller.model.reachability import Reachability
 from needle_controller.presets.own_parts import OwnPartError
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import (
@@ -30,20 +29,17 @@ from needle_controller.protocol.motion_monitors import (
     StepOutcome,
     Watchdog,
 )
-from needle_controller.protocol.plane_control import ControlUpdate, PlaneControl
+from needle_controller.protocol.plane_control import ControlUpdate, PlaneControl, Reachability
 from needle_controller.protocol.start_conditions import is_out, reason_not_to_start
 from needle_controller.protocol.tip_checks import (
     AcceptedTip,
     RejectedTip,
     TipCovariance,
-    TipMeasurement,
 )
 from needle_controller.protocol.tip_queue import TipQueue
 from needle_core.component import Log
+from needle_core.messages import Point
 from needle_core.status_messages import DeviceStatus
-
-_STOPPED_DEVICE = ("FAULT", "ESTOPPED")
-_DISABLED_DEVICE = ("UNCONFIGURED", "DISABLED")
 
 
 class Steering:
@@ -144,7 +140,7 @@ class Steering:
             actions += self._on_retraction(sample)
         return actions + self._check_step(sample) + self._use_tips()
 
-    def on_tip(self, tip: TipMeasurement) -> list[Action]:
+    def on_tip(self, tip: Point) -> list[Action]:
         """Handle a measured tip: use it, queue it until its other data arrive, or reject it."""
         awaited = self._steering and self.awaiting is Awaiting.TIP
         rejection = self.tips.add(tip, self.settings, steering=self._steering, awaited=awaited)
@@ -191,10 +187,10 @@ class Steering:
         actions = self.watchdog.on_device_message()
         if not self._steering:
             return actions
-        if status.state in _STOPPED_DEVICE:
+        if status.state in {"FAULT", "ESTOPPED"}:
             why = f"device is {status.state}: {status.why}"
             return actions + self._leave(SteeringState.FAULT, why, "error")
-        if status.state in _DISABLED_DEVICE:
+        if status.state in {"UNCONFIGURED", "DISABLED"}:
             return actions + self._leave(SteeringState.IDLE, f"device is {status.state}", "warning")
         if self.awaiting is Awaiting.HOLD and status.hold_owner:
             actions += self._await_tip()
@@ -315,8 +311,8 @@ class Steering:
         update, actions = self._update_control(accepted)
         if update is None:
             return actions
-        stamp, joints, slowly = accepted.tip.stamp_ns, accepted.joints, self.confidence.is_doubtful
-        self._ready_step = next_step(stamp, joints, update.command, self.settings, slowly=slowly)
+        joints, slowly = accepted.joints, self.confidence.is_doubtful
+        self._ready_step = next_step(joints, update.command, self.settings, slowly=slowly)
         if self._ready_step is None:
             return actions + self._finish(update, joints)
         return actions + self._send()

@@ -11,6 +11,7 @@ import numpy as np
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_plane import RIG, UNIT_TOLERANCE
 from needle_controller.protocol.joint_history import JointSample
+from needle_core.messages import Point
 
 LARGEST_SCALE = 1.15
 """Largest insertion of the needle per insertion of the stage, whose scale may be wrong."""
@@ -37,25 +38,6 @@ class TipFault(enum.Enum):
 
 Heading = tuple[Array, float]
 """Direction of the tip in `rig`, shape (3,), and the variance of its angle [rad^2]."""
-
-
-@dataclasses.dataclass(frozen=True)
-class TipMeasurement:
-    """A measured tip as received.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Time of exposure [ns].
-    frame_id : str
-        Frame of `position`; must be `rig`.
-    position : ndarray, shape (3,)
-        The tip [m].
-    """
-
-    stamp_ns: int
-    frame_id: str
-    position: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,15 +94,15 @@ class AcceptedTip:
 
     Attributes
     ----------
-    tip : TipMeasurement
-        Tip as received.
+    tip : Point
+        Tip as received; its stamp is the time of exposure.
     joints : JointSample
         Joint positions at its exposure.
     covariance : TipCovariance or None
         Its covariance; None for the configured noise.
     """
 
-    tip: TipMeasurement
+    tip: Point
     joints: JointSample
     covariance: TipCovariance | None = None
 
@@ -129,17 +111,17 @@ class AcceptedTip:
 class RejectedTip:
     """A tip that must not be used, and the reason."""
 
-    tip: TipMeasurement
+    tip: Point
     fault: TipFault
     text: str
 
 
-def check_message(tip: TipMeasurement, last: AcceptedTip | None) -> RejectedTip | None:
+def check_message(tip: Point, last: AcceptedTip | None) -> RejectedTip | None:
     """Check a tip independently of the joints; return the rejection, or None.
 
     Parameters
     ----------
-    tip : TipMeasurement
+    tip : Point
         The tip.
     last : AcceptedTip or None
         The last tip that was used.
@@ -156,13 +138,13 @@ def check_message(tip: TipMeasurement, last: AcceptedTip | None) -> RejectedTip 
 
 
 def check_stamp(
-    tip: TipMeasurement, oldest: JointSample | None, latest: JointSample | None
+    tip: Point, oldest: JointSample | None, latest: JointSample | None
 ) -> RejectedTip | None:
     """Check that joint samples cover a tip's exposure; return the rejection.
 
     Parameters
     ----------
-    tip : TipMeasurement
+    tip : Point
         A tip whose stamp lies outside the joint history.
     oldest, latest : JointSample or None
         Ends of the history.
@@ -177,13 +159,13 @@ def check_stamp(
 
 
 def check_position(
-    tip: TipMeasurement, joints: JointSample, last: AcceptedTip | None, margin: float
+    tip: Point, joints: JointSample, last: AcceptedTip | None, margin: float
 ) -> RejectedTip | None:
     """Check that a needle at these joint positions can have its tip there; return the rejection.
 
     Parameters
     ----------
-    tip : TipMeasurement
+    tip : Point
         A finite tip in `rig`, whose origin is the entry point.
     joints : JointSample
         Joint positions at its exposure.
@@ -203,7 +185,7 @@ def check_position(
         return RejectedTip(tip, TipFault.TOO_FAR, text)
     if last is None:
         return None
-    jump = math.hypot(*(tip.position - last.tip.position))
+    jump = math.dist(tip.position, last.tip.position)
     allowed = abs(joints.insertion - last.joints.insertion) + margin
     if jump <= allowed:
         return None

@@ -11,17 +11,16 @@ from collections import Counter, deque
 
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointHistory, JointSample
-from needle_controller.protocol.motion_monitors import REST_INSERTION
 from needle_controller.protocol.tip_checks import (
     AcceptedTip,
     RejectedTip,
     TipCovariance,
     TipFault,
-    TipMeasurement,
     check_message,
     check_position,
     check_stamp,
 )
+from needle_core.messages import Point
 
 SETTLED_BY = 4
 """Consecutive tips, near one another but far from the last used tip, that supersede it."""
@@ -56,19 +55,19 @@ class TipQueue:
         self.rejected: Counter[TipFault] = Counter()
         self.after_ns = 0
         self._newest_rejected_ns = 0
-        self._queue: list[TipMeasurement] = []
-        self._head: TipMeasurement | None = None
+        self._queue: list[Point] = []
+        self._head: Point | None = None
         self._head_since = 0.0
         self._jumped: list[AcceptedTip] = []
 
     def add(
-        self, tip: TipMeasurement, settings: SteeringSettings, *, steering: bool, awaited: bool
+        self, tip: Point, settings: SteeringSettings, *, steering: bool, awaited: bool
     ) -> RejectedTip | None:
         """Check a received tip; queue it while the needle is steered.
 
         Parameters
         ----------
-        tip : TipMeasurement
+        tip : Point
             The tip.
         settings : SteeringSettings
             Tolerances.
@@ -137,11 +136,7 @@ class TipQueue:
     def has_moved(self) -> bool:
         """Whether the needle has moved since the last used tip."""
         latest, last = self.joints.latest, self.last
-        return (
-            latest is not None
-            and last is not None
-            and abs(latest.insertion - last.joints.insertion) > REST_INSERTION
-        )
+        return not (latest is None or last is None or latest.is_at_rest(last.joints))
 
     def is_outdated(self, step_length: float) -> bool:
         """Return whether the needle moved too far for the last tip; if so, require a later one."""
@@ -207,7 +202,7 @@ class TipQueue:
             del self._queue[0]
         return result
 
-    def _enqueue(self, tip: TipMeasurement) -> None:
+    def _enqueue(self, tip: Point) -> None:
         queue = self._queue
         # A topic keeps its order, so earlier tips with a later stamp had a wrong stamp.
         while queue and queue[-1].stamp_ns > tip.stamp_ns:
@@ -227,9 +222,7 @@ class TipQueue:
         self._jumped.append(accepted)
         return rejection if len(self._jumped) < SETTLED_BY else None
 
-    def _with_covariance(
-        self, tip: TipMeasurement, joints: JointSample
-    ) -> AcceptedTip | RejectedTip | None:
+    def _with_covariance(self, tip: Point, joints: JointSample) -> AcceptedTip | RejectedTip | None:
         newest_first = reversed(self.covariances)
         covariance = next((c for c in newest_first if c.stamp_ns == tip.stamp_ns), None)
         if covariance is None:
@@ -253,7 +246,7 @@ class TipQueue:
         return rejection
 
 
-def _missing_covariance(tip: TipMeasurement) -> RejectedTip:
+def _missing_covariance(tip: Point) -> RejectedTip:
     text = (
         "no needle/tip_pose with the tip's stamp (tip_covariance is from_tip_pose; for a source of "
         "needle/tip alone set it to configured)"

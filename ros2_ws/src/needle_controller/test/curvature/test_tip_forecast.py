@@ -33,11 +33,11 @@ def test_an_arc_is_continued(radius: float, insertion_known: bool) -> None:
     noise = np.random.default_rng(4).normal(0.0, NOISE, (len(INSERTION), 3))
     tips = arc(radius, INSERTION) + noise
     fit = fit_checked(tips, INSERTION if insertion_known else None, CurvatureFitSettings())
-    ahead = forecast_tip(tips, fit, AHEAD)
-    off = np.abs(ahead.tip - arc(radius, np.array(AHEAD)))
-    assert np.all(off <= 1.3 * ahead.interval() + 1e-5)
+    tip, interval = forecast_tip(tips, fit, AHEAD)
+    off = np.abs(tip - arc(radius, np.array(AHEAD)))
+    assert np.all(off <= 1.3 * interval + 1e-5)
     # The forecast is limited by the tissue, and better than a parabola.
-    assert 3e-4 < ahead.interval()[1] < 3e-3
+    assert 3e-4 < interval[1] < 3e-3
 
 
 def test_the_forecast_of_a_straight_needle_is_gaussian_process_regression(
@@ -53,7 +53,7 @@ def test_the_forecast_of_a_straight_needle_is_gaussian_process_regression(
     fit = fit_checked(seen, INSERTION, settings)
     # Known noise, no outliers.
     fit = dataclasses.replace(fit, measurement_std=np.array(NOISE), weights=np.ones(len(INSERTION)))
-    ahead = forecast_tip(seen, fit, AHEAD)
+    tip, interval = forecast_tip(seen, fit, AHEAD)
     places = np.append(INSERTION, AHEAD)
     cells = np.arange(0.0005, AHEAD, 0.001)
     moved = np.maximum(places[:, None] - cells, 0.0) * 0.001
@@ -63,9 +63,9 @@ def test_the_forecast_of_a_straight_needle_is_gaussian_process_regression(
     whole += scale**2 * np.outer(places**2, places**2) / 4.0
     known = whole[:-1, :-1] + NOISE**2 * np.eye(len(INSERTION))
     gain = np.linalg.solve(known, whole[:-1, -1])
-    np.testing.assert_allclose(ahead.tip[:2], gain @ seen[:, :2], atol=5e-6)
+    np.testing.assert_allclose(tip[:2], gain @ seen[:, :2], atol=5e-6)
     spread = math.sqrt(whole[-1, -1] - gain @ whole[:-1, -1])
-    np.testing.assert_allclose(ahead.interval()[:2], 1.96 * spread, rtol=0.01)
+    np.testing.assert_allclose(interval[:2], 1.96 * spread, rtol=0.01)
 
 
 def test_the_command_prints_the_forecast(

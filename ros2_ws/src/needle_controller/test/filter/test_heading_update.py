@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.heading_update import update_by_heading
-from needle_controller.filter.hypothesis_filter import HypothesisFilter
-from needle_controller.filter.mixture import LATE
+from needle_controller.filter.hypothesis_filter import LATE, HypothesisFilter
 from needle_controller.filter.records import E_TURN, ERROR, HYPOTHESIS
 from needle_controller.filter.tip_update import new_workspace
 from needle_controller.model.arc_motion import rotation_exp

@@ -7,7 +7,6 @@ import pytest
 
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.late_tips import FIRST, hidden_age
-from needle_controller.filter.mixture import LATE, WARNINGS
 from needle_controller.many_needles import ManyFilters
 from needle_controller.model.arrays import Array
 
@@ -43,7 +42,7 @@ def inserted_needles(
 
 
 def called_late(filters: ManyFilters) -> Array:
-    return np.asarray(filters.estimates["warnings"] >> WARNINGS.index(LATE) & 1)
+    return np.asarray(filters.needles["late"] > 0.0)
 
 
 @pytest.mark.parametrize("late", [3, 5])

@@ -63,8 +63,7 @@ def taken(
     before: Records, tip: Array, noise: Array = CLAIMED, settings: FilterSettings = PLAIN
 ) -> Records:
     after: Records = before.copy()
-    reading, work = new_reading(), new_workspace()
-    reading.tip[:], reading.covariance[:] = tip, noise
+    reading, work = new_reading(np.array(tip), np.array(noise), np.zeros(4)), new_workspace()
     assert prepare_reading(reading)
     for h in after:
         update_hypothesis(h, reading, settings.assumptions(), work)

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from needle_controller.filter.records import TORSION
+from needle_controller.laws.roll_law import hypotheses_of
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import linearized_from_reduced
 from needle_controller.model.kinematics import REDUCED
@@ -41,5 +42,7 @@ def mixture(rolls: list[float], *, wound: float = 0.0, **first: float) -> Estima
     torsions["weight"] = 1.0 / len(rolls)
     for name, value in first.items():
         torsions[name][0] = value
-    hypotheses = Hypotheses(torsions, 0.0, wound, np.zeros(3))
-    return dataclasses.replace(known(np.zeros(6)), hypotheses=hypotheses)
+    estimate = known(np.zeros(6))
+    mean = hypotheses_of(estimate).mean
+    mean["wound"] = wound
+    return dataclasses.replace(estimate, hypotheses=Hypotheses(mean, torsions))

@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from needle_controller.filter.records import TORSION
-from needle_controller.laws.flip_plan import FlipPlan
-from needle_controller.laws.roll_law import RollLaw, RollLawSettings, base_turn, nearest_turn
+from needle_controller.laws.roll_law import (
+    RollLaw,
+    RollLawSettings,
+    base_turn,
+    bend_sign,
+    check_flips,
+    nearest_turn,
+)
 from needle_controller.observers.estimator import Estimate
 from needle_core.errors import UserError
 
@@ -50,11 +56,11 @@ def test_a_flip_is_mirrored() -> None:
 
 
 def test_flips_are_planned_at_depths_that_increase() -> None:
-    plan = FlipPlan((0.03, 0.07))
-    assert [plan.bend_sign(at) for at in (0.0, 0.0299, 0.0301, 0.0699, 0.0701)] == [1, 1, -1, -1, 1]
-    assert FlipPlan().bend_sign(0.05) == 0.0
+    depths = (0.0, 0.0299, 0.0301, 0.0699, 0.0701)
+    assert [bend_sign((0.03, 0.07), at) for at in depths] == [1, 1, -1, -1, 1]
+    assert bend_sign((), 0.05) == 0.0
     with pytest.raises(UserError, match="flip 2"):
-        FlipPlan((0.05, 0.05)).check_within(0.1)
+        check_flips((0.05, 0.05), 0.1)
 
 
 def test_the_shorter_turn_is_chosen_within_the_winding_limit() -> None:

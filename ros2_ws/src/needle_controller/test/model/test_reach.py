@@ -15,8 +15,6 @@ from needle_controller.model.reachability import (
     check_point,
     least_insertion,
     least_insertion_to_point,
-    point_reachability,
-    reachability,
     widest_at,
 )
 from needle_core.errors import UserError
@@ -68,19 +66,6 @@ def test_reach_is_symmetric_and_broadcasts() -> None:
     assert np.isnan(least_insertion([np.nan, 0.0, 0.0], CURVATURE))
 
 
-def test_the_remaining_depth_decides_reachability() -> None:
-    reduced = [-0.003, 0.0, 0.3]
-    needed = float(least_insertion(reduced, CURVATURE))
-    for spare, expected in ((1e-6, True), (-1e-6, False)):
-        plane = reachability(reduced, CURVATURE, insertion=0.05, end=0.05 + needed + spare)
-        point = point_reachability(
-            [0.0, 0.0, 0.05], CURVATURE, insertion=0.05, end=0.1 + spare, tolerance=1e-9
-        )
-        assert (bool(plane.reachable), bool(point.reachable)) == (expected, expected)
-        assert float(plane.depth) == pytest.approx(0.05 + needed)
-        assert float(point.depth) == pytest.approx(0.1)
-
-
 def path(curvatures: Array, length: float) -> Array:
     """Return the end (x, 0, z) of a plane path from the origin along z, by small chords [m]."""
     part = length / len(curvatures)
@@ -118,11 +103,8 @@ def test_no_path_is_shorter_than_the_least_insertion_or_beyond_the_widest_offset
         radius * np.arcsin(0.06 / (radius - 0.0005)), rel=1e-6
     )
     assert np.all(np.isnan(least_insertion_to_point([[0.01, 0.0, 0.0], [0.0, 0.0, -0.01]], 8.0)))
-    there = point_reachability(
-        [0.0, 0.0005, -0.0005], CURVATURE, insertion=0.1, end=0.1, tolerance=0.001
-    )
-    assert bool(there.reachable)
-    assert there.depth == pytest.approx(0.1)
+    there = least_insertion_to_point([0.0, 0.0005, -0.0005], CURVATURE, tolerance=0.001)
+    assert float(there) == 0.0
 
 
 def test_rejections_of_a_point_give_the_reason_and_a_better_entry() -> None:

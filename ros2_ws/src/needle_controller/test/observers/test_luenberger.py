@@ -32,12 +32,12 @@ STEP = 0.001
 
 def observer(**changes: Any) -> LuenbergerObserver:
     settings = dataclasses.replace(SETTINGS, **changes)
-    return LuenbergerObserver(observer_settings(settings, settings.gains()))
+    return LuenbergerObserver(observer_settings(settings))
 
 
 def law(**changes: Any) -> LinearizingLaw:
     settings = dataclasses.replace(SETTINGS, **changes)
-    made = make_law(settings, settings.gains())
+    made = make_law(settings)
     assert isinstance(made, LinearizingLaw)
     return made
 
@@ -118,14 +118,15 @@ def test_many_needles_equal_single_ones() -> None:
     tips = rng.normal(0.0, 2e-3, (20, count, 3))
     turns = rng.normal(0.0, 0.1, (20, count))
     tips[3, 2] = np.nan
-    gains = SETTINGS.gains()
-    many = ManyObservers(observer_settings(SETTINGS, gains), law().gains, count)
+    many = ManyObservers(observer_settings(SETTINGS), count)
     every = [observer() for _ in range(count)]
     many.start(tips[0].copy())
     for n, one in enumerate(every):
         one.reset(tips[0, n], np.zeros(2))
     for tip, turn in zip(tips[1:], turns[1:], strict=True):
-        rates = many.step(np.full(count, STEP), np.zeros(count), turn, tip, np.zeros(count))
+        many.advance(np.full(count, STEP), turn)
+        many.correct(tip, None, np.zeros(count))
+        rates = many.rates(law().gains)
         for n, one in enumerate(every):
             one.advance(STEP, turn[n])
             one.correct(tip[n])
@@ -135,7 +136,7 @@ def test_many_needles_equal_single_ones() -> None:
 def saturated(s: list[float], margin: float = 0.0) -> tuple[Array, bool]:
     needle = np.zeros(1, OBSERVER)[0]
     needle["linearized"] = s
-    settings = observer_settings(SETTINGS, SETTINGS.gains())
+    settings = observer_settings(SETTINGS)
     saturate(needle, settings._replace(saturation_margin=margin))
     return needle["linearized"], bool(needle["saturated"])
 

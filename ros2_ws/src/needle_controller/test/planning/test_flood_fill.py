@@ -9,8 +9,7 @@ import pytest
 
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_controller.planning import entry as entries
-from needle_controller.planning.entry import first_path
+from needle_controller.planning import path_planner
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
@@ -45,7 +44,7 @@ def _loaded() -> None:
 @pytest.fixture
 def _no_hint(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip the search for another entry, which takes seconds at a wall of rods."""
-    monkeypatch.setattr(entries, "nearest_entry", lambda *_: None)
+    monkeypatch.setattr(PathPlanner, "nearest_entry", lambda *_: None)
 
 
 @pytest.mark.usefixtures("_no_hint")
@@ -55,7 +54,7 @@ def test_a_wall_with_a_gap_has_a_path_and_one_without_has_none() -> None:
     assert may(wall(clear + 0.001))
     # The resolution of the fill is a cell and 0.1 mm of bending.
     assert not may(wall(clear - 0.0015))
-    found = first_path(PLANNER, ENTRY, TARGET, wall(clear - 0.0015))
+    found = PLANNER.first_path(ENTRY, TARGET, wall(clear - 0.0015))
     assert isinstance(found, str)
     assert "no path to the target point is clear of the" in found
 
@@ -98,8 +97,8 @@ def test_the_flood_fill_never_excludes_an_existing_path() -> None:
 def test_a_failed_search_is_not_reported_as_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     # Wide enough for the resolution of the fill, too narrow for a needle.
     narrow = wall(2.0 * SETTINGS.least_clearance - 0.0003)
-    monkeypatch.setattr(entries, "THOROUGH_STARTS", 5)
-    found = first_path(PLANNER, ENTRY, TARGET, narrow)
+    monkeypatch.setattr(path_planner, "THOROUGH_STARTS", 5)
+    found = PLANNER.first_path(ENTRY, TARGET, narrow)
     assert isinstance(found, str)
     assert "was found clear of the" in found
 
@@ -114,6 +113,6 @@ def test_the_thorough_search_finds_more_than_the_quick_one() -> None:
     target = [0.00404, -0.00454, 0.08293]
     obstacles = Obstacles([Obstacle(row[:3], row[3:6], row[6]) for row in rows])
     assert PLANNER.path(ENTRY, target, obstacles) is None
-    found = first_path(PLANNER, ENTRY, target, obstacles)
+    found = PLANNER.first_path(ENTRY, target, obstacles)
     assert isinstance(found, NeedlePath)
     assert found.evaluation.margin >= 0.0

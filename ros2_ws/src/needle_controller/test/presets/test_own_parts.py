@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 from needle_controller.observers.estimator import pose_estimate
-from needle_controller.planning.entry import entry_state
 from needle_controller.planning.obstacles import Obstacle, Obstacles
-from needle_controller.presets.own_estimator import checked_estimator
-from needle_controller.presets.own_law import OwnLaw, checked_law
+from needle_controller.planning.path_planner import entry_state
+from needle_controller.presets.own_controllers import OwnLaw, checked_estimator, checked_law
 from needle_controller.presets.own_parts import GROUPS, OwnPartError
-from needle_controller.presets.path_steering import PathSteering, checked_planner
-from needle_controller.presets.point_steering import prompt_point_law
+from needle_controller.presets.path_steering import OwnPlanner, PathSteering, checked_planner
+from needle_controller.presets.point_steering import point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_core.errors import UserError
@@ -194,7 +193,7 @@ def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) ->
     own = OwnLaw(checked_law(settings.law), settings).to_point
     # A quarter of a circle of 50 mm radius, and behind.
     for target, left in (((0.05, 0.0, 0.05), 0.05 * np.pi / 2.0), ((0.0, 0.0, -0.02), -0.02)):
-        for to_point in (own, prompt_point_law(settings)):
+        for to_point in (own, point_law(settings, is_prompt=True)):
             assert to_point(estimate, target).insertion_left == pytest.approx(left)
 
 
@@ -217,6 +216,7 @@ def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
 
 def test_an_own_planner_steers_by_its_via_points(offer: Offer) -> None:
     settings = SteeringSettings(planner=offer("planner", PLANNER))
+    own = OwnPlanner(checked_planner(settings.planner), settings)
     way, target = PathSteering(settings), np.array([0.0, 0.0, 0.08])
     tip = entry_state(settings.curvature)
     sphere = Obstacle((0.0, 0.0, 0.04), (0.0, 0.0, 0.04), 0.003)
@@ -224,7 +224,7 @@ def test_an_own_planner_steers_by_its_via_points(offer: Offer) -> None:
         (Obstacles(), target, None),
         (Obstacles([sphere]), np.array([0.0, -0.01, 0.04]), 2.0 * np.hypot(0.01, 0.04)),
     ):
-        route = way.route(tip, target, obstacles, 0.0)
+        route = own.route(tip, target, obstacles)
         assert route is not None
         np.testing.assert_allclose(route.aim, aim)
         assert route.length == pytest.approx(length)

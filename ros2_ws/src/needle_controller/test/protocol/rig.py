@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import Action, Awaiting, SendStep, SteeringState
 from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.tip_checks import TipMeasurement
 from needle_core.component import Log
+from needle_core.messages import Point
 from needle_core.status_messages import DeviceStatus
 
 TICK = 20_000_000
@@ -80,11 +78,11 @@ class Rig:
             actions += self.joints()
         return actions
 
-    def measured(self, x: float = 0.0, ahead: int = 0) -> TipMeasurement:
+    def measured(self, x: float = 0.0, ahead: int = 0) -> Point:
         """Return a tip of the present position, with a stamp `ahead` ns from now."""
-        return TipMeasurement(self.now + ahead, "rig", np.array([x, 0.0, self.insertion]))
+        return Point(self.now + ahead, "rig", (x, 0.0, self.insertion))
 
-    def expose(self, tip: TipMeasurement | None = None, x: float = 0.0) -> list[Action]:
+    def expose(self, tip: Point | None = None, x: float = 0.0) -> list[Action]:
         """Advance by one tick: send joints, then the tip."""
         self.now += TICK
         actions = self.joints()

@@ -7,7 +7,8 @@ import pytest
 
 from needle_controller.protocol.actions import Awaiting, SteeringState
 from needle_controller.protocol.joint_history import CONFIRMED_BY, JointSample
-from needle_controller.protocol.tip_checks import TipFault, TipMeasurement
+from needle_controller.protocol.tip_checks import TipFault
+from needle_core.messages import Point
 
 from .rig import MOVING, SECOND, TICK, Rig, logged, none_sent, sent, state_of
 
@@ -56,7 +57,7 @@ def test_the_stamp_of_a_rejected_tip_counts_up_to_a_tenth_of_a_second_ahead() ->
     for ahead, believed in ((99_000_000, True), (101_000_000, False)):
         rig = Rig()
         before = rig.steering.tips.after_ns
-        nowhere = TipMeasurement(rig.now + ahead, "rig", np.full(3, np.nan))
+        nowhere = Point(rig.now + ahead, "rig", (np.nan,) * 3)
         rig.steering.on_tip(nowhere)
         assert rig.steering.tips.after_ns == (nowhere.stamp_ns if believed else before)
 

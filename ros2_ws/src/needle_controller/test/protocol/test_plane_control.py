@@ -14,6 +14,7 @@ import pytest
 
 from needle_controller.filter import hypothesis_filter
 from needle_controller.model.arrays import Array
+from needle_controller.model.reachability import least_insertion
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.path_steering import path_planner
@@ -71,8 +72,8 @@ class Needle:
             clearance, joints = self.control.obstacles.clearance(self.tip), self.joints
             self.least_clearance = min(self.least_clearance, clearance)
             update = self.control.update(self.tip + self.rng.uniform(-NOISE, NOISE, 3), joints)
-            self.reachable.append(bool(update.reach.reachable))
-            step = next_step(k, joints, update.command, self.settings, slowly=False)
+            self.reachable.append(update.reach.reachable)
+            step = next_step(joints, update.command, self.settings, slowly=False)
             self.blocked = update.blocked
             if step is None or update.blocked:
                 break
@@ -167,6 +168,17 @@ def test_an_update_contains_turn_miss_probability_and_reach() -> None:
     needle.control.restart()
     assert not needle.control.started
     assert needle.control.update(needle.tip, joints).turned == 0.0
+
+
+def test_the_remaining_depth_decides_reachability() -> None:
+    needed = float(least_insertion([-0.003, 0.0, 0.0], PLANE.curvature, tolerance=1e-3))
+    to_point = dataclasses.replace(TO_POINT, target_point=(0.0, 0.0, 0.05))
+    for settings, least, end in ((PLANE, needed, needed), (to_point, 0.05, 0.049)):
+        for spare, expected in ((1e-6, True), (-1e-6, False)):
+            control = PlaneControl(dataclasses.replace(settings, depth=end + 0.002 + spare))
+            reach = control.update(np.zeros(3), JointSample(0, 0.002, 0.0)).reach
+            assert reach.reachable is expected, settings
+            assert reach.depth == pytest.approx(least + 0.002, abs=2e-9)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.004])

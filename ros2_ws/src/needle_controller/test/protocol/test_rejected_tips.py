@@ -9,16 +9,17 @@ import pytest
 
 from needle_controller.model.target_plane import plane_from_pose
 from needle_controller.protocol.actions import Action, Awaiting, SteeringState
-from needle_controller.protocol.tip_checks import TipCovariance, TipFault, TipMeasurement
+from needle_controller.protocol.tip_checks import TipCovariance, TipFault
 from needle_core.component import Log
+from needle_core.messages import Point
 
 from .rig import HOLD, TICK, Rig, logged, none_sent, sent, spied, state_of
 
 STEERING = SteeringState.STEERING
 
 
-def bad(rig: Rig, position: list[float], frame: str = "rig", ahead: int = TICK) -> TipMeasurement:
-    return TipMeasurement(rig.now + ahead, frame, np.array(position))
+def bad(rig: Rig, position: list[float], frame: str = "rig", ahead: int = TICK) -> Point:
+    return Point(rig.now + ahead, frame, (position[0], position[1], position[2]))
 
 
 def covariance_at(rig: Rig, ahead: int = 0) -> TipCovariance:
@@ -63,7 +64,7 @@ def test_an_implausible_tip_is_reported_even_if_none_is_awaited() -> None:
 def test_an_old_tip_is_rejected() -> None:
     rig = Rig()
     rig.steering.tips.after_ns = 0
-    assert "older" in logged(rig.steering.on_tip(TipMeasurement(1, "rig", np.zeros(3))))
+    assert "older" in logged(rig.steering.on_tip(Point(1, "rig", (0.0, 0.0, 0.0))))
     rig.steps(1)
     assert "not newer" in logged(rig.steering.on_tip(bad(rig, [0.0] * 3, ahead=TICK - rig.now)))
 

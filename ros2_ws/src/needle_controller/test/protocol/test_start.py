@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from needle_controller.planning import entry
 from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.path_planner import PathPlanner
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import Awaiting, SteeringState
 from needle_controller.protocol.steering import Steering
@@ -101,7 +101,7 @@ def test_a_needle_that_is_out_restarts_the_estimate() -> None:
 
 def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.MonkeyPatch) -> None:
     # The search for another entry is tested with the planner.
-    monkeypatch.setattr(entry, "nearest_entry", lambda *_: None)
+    monkeypatch.setattr(PathPlanner, "nearest_entry", lambda *_: None)
     rig, target = Rig(started=False), (0.0, 0.0, 0.06)
     control = rig.steering.control
     control.target_point = np.array(target)

@@ -9,17 +9,17 @@ from needle_controller.protocol.tip_checks import (
     AcceptedTip,
     TipCovariance,
     TipFault,
-    TipMeasurement,
     check_position,
 )
+from needle_core.messages import Point
 
 NAN, INF = np.nan, np.inf
 MARGIN = 0.004
 NOW = JointSample(100, 0.1, 0.0)
 
 
-def tip(*place: float) -> TipMeasurement:
-    return TipMeasurement(100, "rig", np.array(place))
+def tip(x: float, y: float, z: float) -> Point:
+    return Point(100, "rig", (x, y, z))
 
 
 LAST = AcceptedTip(tip(0.0, 0.0, 0.099), JointSample(50, 0.099, 0.0))
