@@ -379,7 +379,10 @@ class Steering:
         if gap < 0.0:
             self.tips.forget_stamps()
         away = self._retraction.add_jump(before, sample, tolerance)
-        why = self._retraction.reason if away else f"the clock of joint_states went {gap:.4g} s"
+        here = (
+            f"the clock of joint_states went {gap:.4g} s" if gap < 0.0 else "joint_states are back"
+        )
+        why = self._retraction.reason if away else here
         if not self._steering:
             return [Log("warning", why)]
         return self._leave(SteeringState.IDLE, why, "warning")
