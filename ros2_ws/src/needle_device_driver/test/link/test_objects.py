@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from pathlib import Path
@@ -63,6 +64,16 @@ def test_reverse_drive_swaps_its_limits() -> None:
 def test_invalid_parameter_is_refused(parameter: str, value: Any) -> None:
     with pytest.raises(UserError, match=parameter.removeprefix("insertion_")):
         DeviceDriverParameters(**{parameter: value})
+
+
+def test_homing_methods_are_those_of_cia402_to_a_switch_an_index_pulse_or_here() -> None:
+    def is_known(method: int) -> bool:
+        with contextlib.suppress(UserError):
+            return bool(dataclasses.replace(DRIVE, homing_method=method))
+        return False
+
+    known = [method for method in range(-5, 40) if is_known(method)]
+    assert known == [*range(1, 15), *range(17, 31), 33, 34, 35, 37]
 
 
 def test_drive_bounds_follow_the_limits() -> None:
