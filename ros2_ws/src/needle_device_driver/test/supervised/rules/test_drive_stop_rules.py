@@ -89,9 +89,12 @@ def test_drive_watchdog_is_disarmed_at_exit_by_a_drive_that_is_off() -> None:
     bench = DriveBench().moving()
     # A drive that does not report off keeps its watchdog.
     bench.insertion.syncs = False
+    before = len(bench.bus.sent)
     bench.run(bench.supervisor.deconfigure())
     assert bench.state == "FAULT"
     assert "insertion axis: does not confirm power-off" in bench.notices[-1].text
+    # The silent drive is given up after 16 cycles; the other one is at rest and off after five.
+    assert [cob for cob, _ in bench.bus.sent[before:]].count(0x80) == 16 + 5
     assert bench.insertion.value(0x1016, 1) == 127 << 16 | 100
     assert (bench.rotation.value(0x1016, 1), bench.rotation.state) == (0, "disabled")
     with pytest.raises(AxisError, match="insertion axis is not configured"):

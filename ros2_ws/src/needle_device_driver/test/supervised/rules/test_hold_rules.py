@@ -125,7 +125,8 @@ def test_hold_new_press_first_press_counts_only_without_session() -> None:
     bench = enabled()
     assert send_holds(bench, "b/s+") == "-"
     assert bench.rule == "hold_new_press"
-    assert bench.status.reason == "hold of 'b/s' ignored (hold_new_press)"
+    ignored = "hold of 'b/s' ignored (hold_new_press)"
+    assert (bench.status.reason, bench.status.text) == (ignored, ignored)
     # A message that is typed may have no stamp.
     assert send_holds(bench, "by_hand#0+") == "by_hand"
 
@@ -262,8 +263,10 @@ def test_command_newer_stamps_are_used_once_and_a_reset_accepts_older_ones() -> 
     bench.step()
     assert bench.outcomes[-1].endswith("call device/reset to accept commands again")
     assert bench.reset().success
-    bench.go()
     bench.press()
+    bench.step()
+    assert bench.rule == "command_newer", "not newer than the reset"
+    bench.go()
     bench.step()
     assert bench.state == "MOVING"
     bench.supervisor.stop()

@@ -24,20 +24,20 @@ def test_coordinated_joints_are_in_proportion_at_any_speed() -> None:
     bench.go()
     assert bench.positions == (0.001, -0.5)
     assert (bench.status.insertion_m, bench.status.rotation_rad) == bench.positions
+    assert (bench.status.reason, bench.status.text) == ("", "HOLDING")
     assert (bench.results, bench.state) == ([(stamp, "succeeded")], "HOLDING")
 
 
 @pytest.mark.parametrize(("which", "bound"), [("insertion", 0.0005), ("rotation", 0.1)])
 def test_following_error_bound_stops_both(which: str, bound: float) -> None:
-    for share, state in ((0.999, "MOVING"), (1.001, "FAULT")):
+    for share, state in ((0.999, "MOVING"), (1.002, "FAULT")):
         bench = Bench().moving()
         bench.axis(which).position -= share * bound
         bench.supervisor.drive(PERIOD, bench.now)
         assert bench.state == state, bench.status.fault
     assert bench.rule == "following_error"
-    limit = {"insertion": "limit 0.5 mm", "rotation": "limit 0.1 rad"}[which]
-    assert f"the {which} axis is" in bench.status.fault
-    assert bench.status.fault.endswith(limit)
+    off, limit = {"insertion": ("0.501 mm", "0.5 mm"), "rotation": ("0.100 rad", "0.1 rad")}[which]
+    assert bench.status.fault == f"the {which} axis is {off} off its set-point, limit {limit}"
     assert bench.insertion.orders[-2:] == bench.rotation.orders[-2:] == ["stop", "off"]
 
 
@@ -51,7 +51,10 @@ def test_settling_time_is_one_second(which: str) -> None:
     assert bench.state == "MOVING"
     bench.go(2)
     assert (bench.state, bench.rule) == ("FAULT", "settling_time")
-    assert "not at their target 1 s after the last set-point" in bench.status.fault
+    off = "0.0400 mm, rotation 0.00000" if which == "insertion" else "0.0000 mm, rotation 0.00400"
+    assert bench.status.fault == (
+        f"the axes are not at their target 1 s after the last set-point: insertion {off} rad off"
+    )
 
 
 # ---- retraction ---------------------------------------------------------------------------------
@@ -188,4 +191,5 @@ def test_homing_time_bound_of_each_axis(which: str, longest: float) -> None:
         assert bench.state == "MOVING"
         bench.wait(3)
         assert (bench.state, bench.rule) == ("FAULT", "homing_time")
-        assert f"the {which} axis did not find its home switch in" in bench.status.fault
+        text = f"the {which} axis did not find its home switch in {longest:.0f} s"
+        assert bench.status.fault == text

@@ -83,24 +83,32 @@ def test_max_rotation_rate_slows_the_insertion() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rule", "points"),
+    ("rule", "value", "points"),
     [
-        ("forward_only", [(0.001, 0.0, 0.2), (0.001, 0.0, 0.4), (0.0015, 0.0, 0.6)]),
-        ("max_speed", [(0.0005, 0.0, 0.09), (0.001, 0.0, 0.3), (0.0015, 0.0, 0.5)]),
-        ("max_rotation_step", [(0.0005, 0.7, 0.3), (0.001, 1.3, 0.6), (0.0015, 0.7, 0.9)]),
-        ("max_rotation_rate", [(0.0005, 0.0, 0.1), (0.001, -0.7, 0.3), (0.0015, -0.7, 0.5)]),
-        ("max_turns", [(0.0005, 0.4, 0.3), (0.001, 0.7, 0.6), (0.0015, 0.4, 0.9)]),
-        ("max_depth", [(0.001, 0.0, 0.3), (0.0017, 0.0, 0.6)]),
-        ("max_step_length", [(0.001, 0.0, 0.3), (0.0021, 0.0, 0.6)]),
+        (
+            "forward_only",
+            "before, 1 mm",
+            [(0.001, 0.0, 0.2), (0.001, 0.0, 0.4), (0.0015, 0.0, 0.6)],
+        ),
+        ("max_speed", "5.54444", [(0.0005, 0.0, 0.09), (0.001, 0.0, 0.3), (0.0015, 0.0, 0.5)]),
+        ("max_rotation_step", "1.3", [(0.0005, 0.7, 0.3), (0.001, 1.3, 0.6), (0.0015, 0.7, 0.9)]),
+        (
+            "max_rotation_rate",
+            "3.4995",
+            [(0.0005, 0.0, 0.1), (0.001, -0.7, 0.3), (0.0015, -0.7, 0.5)],
+        ),
+        ("max_turns", "0.111408", [(0.0005, 0.4, 0.3), (0.001, 0.7, 0.6), (0.0015, 0.4, 0.9)]),
+        ("max_depth", "1.7", [(0.001, 0.0, 0.3), (0.0017, 0.0, 0.6)]),
+        ("max_step_length", "2.1", [(0.001, 0.0, 0.3), (0.0021, 0.0, 0.6)]),
     ],
 )
 def test_each_piece_of_a_path_is_bounded(
-    rule: str, points: list[tuple[float, float, float]]
+    rule: str, value: str, points: list[tuple[float, float, float]]
 ) -> None:
     limits = {"max_turns": {"max_turns": 0.1}, "max_depth": {"max_depth": 0.0016}}
     bench = Bench(**limits.get(rule, {})).ready()
     bench.submit(*points)
-    bench.refused(rule)
+    assert f" {value}" in bench.refused(rule)
 
 
 def test_command_state_step_and_path_do_not_replace_each_other() -> None:
@@ -168,6 +176,9 @@ def test_command_form_path_must_not_begin_ahead_of_the_needle() -> None:
     # Up to the tolerance of the axes.
     path(bench, (0.001, 0.0), (1.1, 0.1), (1.5, 0.1))
     assert bench.state == "MOVING"
+    bench.go(5)
+    path(bench, (0.6, 0.0), (1.1, 0.1), (1.5, 0.1))
+    assert bench.outcomes[-1].endswith("at 0.6 mm, ahead of the needle at 0.5 mm")
 
 
 # ---- an insertion axis that a hand pushes -------------------------------------------------------

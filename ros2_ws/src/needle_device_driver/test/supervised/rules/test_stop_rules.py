@@ -7,7 +7,16 @@ from typing import Any
 
 import pytest
 
+from needle_core.diagnostics import Level
+from needle_core.status_messages import DeviceStatus
+
 from ..ideal_axes import Bench
+
+
+def test_nothing_is_reported_before_the_set_up() -> None:
+    at_start = DeviceStatus(level=Level.WARN, text="UNCONFIGURED", state="UNCONFIGURED")
+    bench = Bench()
+    assert (bench.status, bench.supervisor.stops) == (at_start, 0)
 
 
 def test_estop_latches_until_hold_release_and_reset() -> None:
