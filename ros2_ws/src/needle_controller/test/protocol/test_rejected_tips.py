@@ -105,10 +105,11 @@ def test_a_tip_timeout_ends_with_a_good_tip() -> None:
 
 def test_missing_inputs_are_named_after_the_tip_timeout() -> None:
     for covariance, cause in (
-        ("configured", "joint_states do not show the end of step 1"),
+        ("configured", "joint_states do not show the end of step 4"),
         ("from_tip_pose", "set it to configured"),
     ):
         rig = Rig(tip_covariance=covariance)
+        rig.steps(3 * (covariance == "configured"))
         actions = rig.expose()
         if covariance == "configured":
             rig.steering.on_result(sent(actions).stamp_ns, "succeeded")
