@@ -54,6 +54,15 @@ def test_coordinated_path_replaces_another_without_a_stop() -> None:
     assert bench.results == [(first, "replaced"), (second, "succeeded")]
 
 
+def test_coordinated_path_may_have_a_knot_at_the_needle() -> None:
+    bench = Bench().ready()
+    straight(bench)
+    bench.go(10)
+    path(bench, (0.5, 0.0), (1.0, 0.0), (2.0, 0.2))
+    bench.go(5)
+    assert bench.positions == pytest.approx((0.0015, 0.1))
+
+
 def test_forward_only_path_that_ends_at_the_needle_moves_nothing() -> None:
     bench = Bench().ready()
     path(bench, (0.0, 0.0), (0.5, 0.1), (1.0, 0.1))
@@ -89,6 +98,11 @@ def test_max_rotation_rate_slows_the_insertion() -> None:
             "forward_only",
             "before, 1 mm",
             [(0.001, 0.0, 0.2), (0.001, 0.0, 0.4), (0.0015, 0.0, 0.6)],
+        ),
+        (
+            "forward_only",
+            "before, 1 mm",
+            [(1e-3, 0.0, 0.2), (9e-4, 0.0, 0.4), (2e-3, 0.0, 0.6)],
         ),
         ("max_speed", "5.54444", [(0.0005, 0.0, 0.09), (0.001, 0.0, 0.3), (0.0015, 0.0, 0.5)]),
         ("max_rotation_step", "1.3", [(0.0005, 0.7, 0.3), (0.001, 1.3, 0.6), (0.0015, 0.7, 0.9)]),
