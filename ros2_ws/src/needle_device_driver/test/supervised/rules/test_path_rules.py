@@ -213,17 +213,13 @@ def test_coordinated_rotation_follows_a_pushed_needle() -> None:
     bench = pushed()
     path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.1))
     bench.go()
-    farthest = 0.0
-    for distance in (1e-4, 3e-4, -2e-4, 4e-4, 5e-4, 3e-4):
-        push(bench, distance)
-        bench.go(3)
-        farthest = max(farthest, bench.positions[0])
-        wanted = np.interp(farthest, [0.0, 0.001, 0.002], [0.0, 0.3, 0.1])
+    for tenth in range(1, 20):
+        push(bench, 1e-4)
+        wanted = np.interp(0.1 * tenth, [0.0, 1.0, 2.0], [0.0, 0.3, 0.1])
         assert bench.positions[1] == pytest.approx(wanted)
     assert bench.status.reason == ""
     assert "move" not in bench.insertion.orders
-    push(bench, 7e-4)
-    bench.go(3)
+    push(bench, 2e-4)
     assert bench.outcomes == ["succeeded"]
     assert "by hand" in bench.retract().message
 
