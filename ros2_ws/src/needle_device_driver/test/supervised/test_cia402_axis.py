@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from .drive_bench import RAD, DriveBench
+from .supervisor_bench import rejected
 
 
 @pytest.mark.parametrize(("reverse", "sign"), [(False, 1), (True, -1)])
@@ -32,7 +33,7 @@ def test_enable_and_home_wait_until_the_axes_are_off() -> None:
     bench = DriveBench().ready()
     bench.enable(False)
     for reply in (bench.enable(), bench.home()):
-        assert reply.message == "waiting for the axes to switch off"
+        assert reply == rejected("waiting for the axes to switch off")
     bench.wait(10)
     assert bench.enable().success
 

@@ -10,7 +10,7 @@ from needle_core.messages import Trajectory, TrajectoryPoint
 from needle_device_driver.supervisor.command import check_form
 
 from ..ideal_axes import Bench
-from ..supervisor_bench import NAMES, PERIOD
+from ..supervisor_bench import NAMES, PERIOD, rejected
 
 MS = 1_000_000
 Point = tuple[float, float, float]
@@ -39,7 +39,7 @@ def test_command_state_second_command_does_not_affect_the_step() -> None:
     other = bench.step(0.002, 1.0)
     # With its own stamp, the result would mean the end of the running step.
     bench.step(0.002, 1.0, stamp_ns=int(str(stamp)))
-    assert bench.reset().message == "a step is under way"
+    assert bench.reset() == rejected("a step is under way")
     bench.go(20)
     refusal = "aborted: the device is MOVING, not HOLDING"
     assert bench.results == [(other, refusal), (stamp, "succeeded")]

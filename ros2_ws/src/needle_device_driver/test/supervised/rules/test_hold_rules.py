@@ -12,6 +12,7 @@ import pytest
 from needle_device_driver.rules import Rule
 
 from ..ideal_axes import Bench
+from ..supervisor_bench import accepted, rejected
 
 MS = 1_000_000
 
@@ -92,7 +93,7 @@ def test_hold_age_expired_press_does_not_block_reset() -> None:
     bench = Bench().ready()
     bench.supervisor.fail("test")
     bench.hold()
-    assert bench.reset().message == "release the hold first"
+    assert bench.reset() == rejected("release the hold first")
     bench.now += 0.25
     assert not bench.reset().success
     bench.now += 0.001
@@ -112,7 +113,8 @@ def test_hold_new_press_earlier_press_does_not_count(event: str) -> None:
         bench.press()
         assert bench.enable().success
     else:
-        assert (bench.reset() if event == "reset" else bench.supervisor.stop()).success
+        reply = bench.reset() if event == "reset" else bench.supervisor.stop()
+        assert reply == accepted("nothing to reset" if event == "reset" else "nothing moves")
     bench.go(5)
     assert (bench.status.hold_owner, bench.status.speed_scale) == ("", 0.0)
     assert bench.status.press_again == "a"

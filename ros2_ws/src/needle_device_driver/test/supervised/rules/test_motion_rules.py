@@ -7,7 +7,7 @@ import math
 import pytest
 
 from ..ideal_axes import Bench
-from ..supervisor_bench import PERIOD
+from ..supervisor_bench import PERIOD, accepted, rejected
 
 
 def test_coordinated_joints_are_in_proportion_at_any_speed() -> None:
@@ -77,15 +77,15 @@ def inserted(*, homed: bool = True) -> Bench:
 def test_retraction_is_slow_without_rotation_and_needs_the_hold() -> None:
     bench = inserted()
     bench.insertion.powered = False
-    assert bench.retract().message == "the axes are not powered yet"
+    assert bench.retract() == rejected("the axes are not powered yet")
     bench.insertion.powered = True
     bench.hold(False)
-    assert bench.retract().message == "press the hold first and keep it pressed"
+    assert bench.retract() == rejected("press the hold first and keep it pressed")
     bench.hold()
     rotation = bench.rotation.position
     bench.rotation.orders.clear()
-    assert bench.retract().message == "retracting 3.0 mm while the hold lasts"
-    assert bench.retract().message == "the device is MOVING, not HOLDING"
+    assert bench.retract() == accepted("retracting 3.0 mm while the hold lasts")
+    assert bench.retract() == rejected("the device is MOVING, not HOLDING")
     bench.go(10)
     bench.hold(False)
     bench.wait(5)
@@ -95,7 +95,7 @@ def test_retraction_is_slow_without_rotation_and_needs_the_hold() -> None:
     bench.go(100)
     assert (bench.positions, bench.state) == ((0.0, rotation), "HOLDING")
     assert "move" not in bench.rotation.orders
-    assert bench.retract().message == "the needle is out"
+    assert bench.retract() == accepted("the needle is out")
 
 
 def test_retraction_ignores_inner_switch_and_rotation() -> None:
@@ -119,10 +119,10 @@ def test_unhomed_outward_only_by_the_last_known_depth() -> None:
     bench.go(40)
     # Only the remaining distance is allowed.
     bench.press()
-    assert bench.retract().message == "retracting 1.4 mm while the hold lasts"
+    assert bench.retract() == accepted("retracting 1.4 mm while the hold lasts")
     bench.go(100)
     assert bench.insertion.position == pytest.approx(-0.003)
-    assert bench.retract().message == "the needle is out"
+    assert bench.retract() == accepted("the needle is out")
 
 
 def test_unhomed_outward_only_to_the_switch_or_by_max_depth() -> None:
@@ -132,13 +132,13 @@ def test_unhomed_outward_only_to_the_switch_or_by_max_depth() -> None:
     bench.insertion.switch = True
     bench.go()
     assert bench.state == "HOLDING"
-    assert bench.retract().message == "the needle is out"
+    assert bench.retract() == accepted("the needle is out")
     bench = Bench(max_depth=0.1)
     bench.insertion.switch = False
     bench.configure()
     bench.enable()
     bench.hold()
-    assert bench.retract().message == "retracting 100.0 mm while the hold lasts"
+    assert bench.retract() == accepted("retracting 100.0 mm while the hold lasts")
 
 
 # ---- homing -------------------------------------------------------------------------------------
@@ -148,25 +148,25 @@ def test_homing_needle_out_needs_confirmation_until_the_next_step() -> None:
     bench = Bench()
     bench.configure()
     confirm = "confirm first that the needle is out (confirm_needle_out)"
-    assert bench.run(bench.supervisor.home(bench.now)).message == confirm
+    assert bench.run(bench.supervisor.home(bench.now)) == rejected(confirm)
     bench.ready()
-    assert bench.home().message == "the device is HOLDING, not DISABLED"
+    assert bench.home() == rejected("the device is HOLDING, not DISABLED")
     for length, is_out in ((-1.0, True), (0.001, False)):
         bench.step(length)
         assert bench.status.needle_out_confirmed is is_out, "one that is refused ends nothing"
     bench.enable(False)
-    assert bench.run(bench.supervisor.home(bench.now)).message == confirm
+    assert bench.run(bench.supervisor.home(bench.now)) == rejected(confirm)
 
 
 def test_homing_needle_out_can_be_stopped() -> None:
     bench = Bench()
     bench.insertion.position = 0.01
     bench.configure()
-    assert bench.home().message == "homing"
+    assert bench.home() == accepted("homing")
     assert bench.supervisor.may_move(bench.now), "without a hold"
     assert not bench.supervisor.confirm_needle_out(False).success
     bench.wait(5)
-    assert bench.supervisor.stop().message == "homing stopped"
+    assert bench.supervisor.stop() == accepted("homing stopped")
     bench.wait(5)
     assert bench.insertion.position == pytest.approx(0.01 - 5 * 0.002 * PERIOD)
     assert (bench.state, bench.insertion.powered) == ("DISABLED", False)
