@@ -312,9 +312,10 @@ class PlaneControl:
         """Compile the code of updates, which would otherwise delay the first steps."""
         settings, length = self._settings, self._settings.step_length
         estimator, law = make_controller(settings, np.eye(3))
-        estimator.reset(np.zeros(3), np.zeros(2))
+        position = np.zeros(3)
+        estimator.reset(position, np.zeros(2))
         estimator.advance(length, 0.0)
-        estimator.correct([0.0, 0.0, length], settings.configured_covariance())
+        estimator.correct(position, settings.configured_covariance())
         estimate = estimator.estimate()
         law(estimate, length)
         if settings.steers_to_points:
