@@ -102,6 +102,7 @@ FATAL, OPTIONAL = "NOT USABLE: ", "optional: "
     [
         ("605A", READ_ONLY, 1, FATAL + "fixed at 2"),
         ("1016sub1", READ_ONLY, 1, "drive_watchdog"),
+        ("1016sub1", {"DataType": "0x1B"}, 1, FATAL + "has 8 bytes"),
         ("605A", READ_ONLY | {"ParameterValue": "0x6"}, 0, "ok"),
         ("605A", {"AccessType": "const"}, 0, "unknown: read-only"),
         ("605B", READ_ONLY, 0, OPTIONAL + "fixed at 2"),
@@ -145,6 +146,9 @@ def test_objects_are_those_that_canopen_reads(tmp_path: Path) -> None:
     sections["1800sub1"] |= {"DefaultValue": "$NODEID+0x180", "ParameterValue": "0x190"}
     sections["60C2sub2"] |= {"AccessType": "rww", "LowLimit": "0x80", "HighLimit": "63"}
     sections["6064"] |= {"LowLimit": "0xFFFFFF38", "HighLimit": "0xC8"}
+    # Boolean and 64 bits.
+    for index, kind in (("2000", "0x1"), ("2001", "0x15"), ("2002", "0x1B")):
+        sections[index] = sections["6064"] | {"DataType": kind}
     sections["1003"] = {"ParameterName": "Errors", "ObjectType": "0x8", "CompactSubObj": "3"}
     sections["1003"] |= {"DataType": "0x6", "AccessType": "ro", "DefaultValue": "7"}
     file = write(sections, tmp_path / "drive.dcf")
