@@ -133,6 +133,23 @@ def test_drive_without_a_required_object_or_value_is_refused(drive: Change, text
     assert bench.state == "FAULT"
 
 
+@pytest.mark.parametrize(
+    ("drive", "seconds"),
+    [
+        (has(state="enabled", ignored_orders={"off"}), 1.0),
+        (lacks(0x6502) | has(modes={8}), 0.5),
+        (has(beats=False), 1.0),
+    ],
+)
+def test_set_up_waits_a_limited_time(drive: Change, seconds: float) -> None:
+    bench = DriveBench()
+    change(bench.insertion, drive)
+    bench.sdo_time = 0.001
+    start = bench.now
+    bench.refusal()
+    assert seconds < bench.now - start < seconds + 0.3
+
+
 def no_types(types: bytes) -> Change:
     """Refuse transmission types of received PDOs."""
     lacking = types[:1], types[1:]

@@ -144,8 +144,9 @@ def test_drive_emergency_that_persists_keeps_the_fault() -> None:
     bench.after(lambda: bench.insertion.fail(0x7121))
     bench.hold(False)
     bench.wait(5)
-    bench.sdo_time = 0.05
+    bench.sdo_time, before = 0.05, bench.now
     assert "the drive does not leave its fault: 0x7121 motor blocked" in bench.reset().message
+    assert 1.0 < bench.now - before < 1.5
     assert bench.state == "FAULT"
     # Only the edge counts: the last command was a reset already.
     bench.insertion.ignored_orders = set()
