@@ -14,7 +14,7 @@ DISABLED, READY, ON, ENABLED, QUICK_STOP, FAULT = 0x0250, 0x0231, 0x0233, 0x0237
 NUMBERS = itertools.count(1)
 
 
-def state(statusword: int, position: int = 0, mode: int = 8, behind: int = 0) -> Feedback:
+def state(statusword: int, position: int = 0, behind: int = 0, mode: int = 8) -> Feedback:
     return Feedback(next(NUMBERS), statusword, mode, 0, position, behind)
 
 
@@ -75,8 +75,9 @@ def test_blocked_axis_is_released_when_stopped(machine: DriveMachine, behind: in
     enabled(machine)
     machine.stop()
     places = (400, 500, 500, 500, 500)
-    # Two counts are within the limit of rest.
-    given = orders(machine, *(state(QUICK_STOP, place, behind=behind // 3 * 2) for place in places))
+    # A moving axis lags behind; at rest, two counts are within the limit.
+    lags = (*[100 * behind] * 4, behind // 3 * 2)
+    given = orders(machine, *(state(QUICK_STOP, *at) for at in zip(places, lags, strict=True)))
     assert (given, machine.released_after_block) == ([DriveCommand.QUICK_STOP] * 5, False)
     assert orders(machine, state(QUICK_STOP, 500, behind=behind)) == [DriveCommand.DISABLE_VOLTAGE]
     assert machine.released_after_block

@@ -168,6 +168,13 @@ def test_tip_age_unknown_or_from_the_future() -> None:
     bench = Bench().ready()
     bench.step(stamp_ns=bench.ros_ns + 100 * MS)
     assert bench.state == "MOVING"
+    # After ROS time was set back, a stamp may be from before.
+    bench = Bench().ready()
+    bench.go(20)
+    bench.ros_ns -= 200 * MS
+    bench.go()
+    bench.step(stamp_ns=bench.ros_ns - 50 * MS)
+    assert "inf s old" in bench.refused("tip_age")
 
 
 def test_tip_age_bound_is_two_seconds() -> None:
