@@ -25,6 +25,9 @@ def test_steps_add_up_without_rounding_errors(reverse: bool, sign: int) -> None:
 
 def test_velocity_is_measured_over_the_last_cycle() -> None:
     bench = DriveBench().moving()
+    before = bench.axes[0].monitor.feedback.number
+    bench.go(3)
+    assert bench.axes[0].monitor.feedback.number == before + 3
     assert bench.axes[0].poll(bench.now).velocity == pytest.approx(0.002)
     assert bench.axes[1].poll(bench.now).velocity == pytest.approx(0.2, rel=2e-2)
 

@@ -109,7 +109,7 @@ FATAL, OPTIONAL = "NOT USABLE: ", "optional: "
         ("60C2sub2", {"LowLimit": "-0x2"}, 1, FATAL + "-3 is outside [-2, None]"),
         ("60C2sub2", {"LowLimit": "0xFD"}, 0, "ok"),
         ("605A", {"DataType": "0x2"}, 0, "ok"),
-        ("605A", {"DataType": "0x9"}, 2, "quick stop option: 0 bytes, expected 2"),
+        ("605A", {"DataType": "word"}, 2, "quick stop option: 0 bytes, expected 2"),
         ("6085", {"HighLimit": "0x7FFFFFFF"}, 0, "ok"),
         ("6085", {"HighLimit": "1000"}, 1, FATAL + "10000000 is outside [None, 1000]"),
         ("607A", {"PDOMapping": "0"}, 1, FATAL + "0x1601:1 0x607A cannot be mapped"),
