@@ -77,7 +77,7 @@ def test_invalid_parameter_is_refused(parameter: str, value: Any) -> None:
 def test_parameters_of_a_drive_at_their_bounds() -> None:
     given = {"node_id": 126, "following_error_time": 10.0, "max_torque": 5.0}
     named = {f"rotation_{name}": value for name, value in given.items()}
-    drive = drive_settings(DeviceDriverParameters(**named), "rotation")  # type: ignore[arg-type]
+    drive = drive_settings(DeviceDriverParameters(**named), "rotation")
     assert {name: getattr(drive, name) for name in given} == given
     assert drive_settings(DeviceDriverParameters(), "rotation").node_id == 2
 

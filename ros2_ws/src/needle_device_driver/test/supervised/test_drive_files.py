@@ -147,8 +147,8 @@ def test_objects_are_those_that_canopen_reads(tmp_path: Path) -> None:
     sections["60C2sub2"] |= {"AccessType": "rww", "LowLimit": "0x80", "HighLimit": "63"}
     sections["6064"] |= {"LowLimit": "0xFFFFFF38", "HighLimit": "0xC8"}
     # Boolean and 64 bits.
-    for index, kind in (("2000", "0x1"), ("2001", "0x15"), ("2002", "0x1B")):
-        sections[index] = sections["6064"] | {"DataType": kind}
+    for name, kind in (("2000", "0x1"), ("2001", "0x15"), ("2002", "0x1B")):
+        sections[name] = sections["6064"] | {"DataType": kind}
     sections["1003"] = {"ParameterName": "Errors", "ObjectType": "0x8", "CompactSubObj": "3"}
     sections["1003"] |= {"DataType": "0x6", "AccessType": "ro", "DefaultValue": "7"}
     file = write(sections, tmp_path / "drive.dcf")
