@@ -36,6 +36,9 @@ def test_rotation_follows_a_push_over_a_corner_at_its_bounded_rate() -> None:
     assert motion.complete
     assert (set_point.insertion, set_point.insertion_speed) == (4.0, 2.0)
     assert set_point.rotation_speed == pytest.approx(1.0)
+    # The needle may be at the end of the leg already.
+    motion = CoordinatedMotion((2.0, 0.5), [Leg(2.0, 1.5, 0.1)])
+    assert motion.follow(2.0, 1.0, 0.5).rotation == 1.0
 
 
 def test_legs_take_at_least_the_time_of_both_bounds() -> None:
