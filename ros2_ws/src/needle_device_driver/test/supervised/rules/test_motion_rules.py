@@ -125,6 +125,18 @@ def test_unhomed_outward_only_by_the_last_known_depth() -> None:
     assert bench.retract() == accepted("the needle is out")
 
 
+def test_unhomed_outward_only_to_home_if_it_was_lost_beyond_it() -> None:
+    bench = Bench().ready()
+    bench.insertion.position = -0.0005
+    bench.go()
+    bench.insertion.homed = bench.insertion.switch = False
+    bench.go()
+    assert bench.retract() == accepted("the needle is out")
+    bench.insertion.position = 0.001
+    bench.go()
+    assert bench.retract() == accepted("retracting 1.0 mm while the hold lasts")
+
+
 def test_unhomed_outward_only_to_the_switch_or_by_max_depth() -> None:
     bench = inserted(homed=False)
     assert bench.retract().success
