@@ -79,8 +79,9 @@ def test_rejections_name_the_value_and_its_limit() -> None:
 def test_invalid_covariances_are_rejected() -> None:
     for matrix, cause in (
         (np.eye(3) * 1e-12, ""),
-        (np.eye(3) + 0.9e-9 * np.eye(3, k=1), ""),
-        (np.eye(3) + 1.1e-9 * np.eye(3, k=1), "not symmetric"),
+        # Relative to the largest entry.
+        (1e-8 * (np.eye(3) + 0.9e-9 * np.eye(3, k=1)), ""),
+        (1e-8 * (np.eye(3) + 1.1e-9 * np.eye(3, k=1)), "not symmetric"),
         (np.full((3, 3), NAN), "not a number"),
         (np.diag([INF] * 3), "no tip was found"),
         (np.diag([1.0, 1.0, -2.0]), "(its smallest variance is -2 m^2)"),
