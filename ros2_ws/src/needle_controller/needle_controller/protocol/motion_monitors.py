@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 import statistics
 from collections import deque
 
@@ -147,7 +148,7 @@ class RetractionMonitor:
 
     def __init__(self) -> None:
         self._retracted = False
-        self._deepest = 0.0
+        self._deepest = -math.inf
         self._recent: deque[float] = deque(maxlen=_MEDIAN_OF)
         self._jump: tuple[JointSample, JointSample] | None = None
 

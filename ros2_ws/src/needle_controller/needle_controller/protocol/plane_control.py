@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.filter.bank import MERGE_EVERY
 from needle_controller.filter.records import NEAR
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.model.arrays import Array
@@ -329,16 +328,16 @@ class PlaneControl:
         """Compile the code of updates, which would otherwise delay the first steps."""
         settings, length = self._settings, self._settings.step_length
         estimator, law = make_controller(settings, np.eye(3))
-        estimator.reset(np.zeros(3), np.zeros(2))
-        for tips in range(1, MERGE_EVERY + 1):
-            estimator.advance(length, 0.0)
-            estimator.correct([0.0, 0.0, tips * length], settings.configured_covariance())
+        position = np.zeros(3)
+        estimator.reset(position, np.zeros(2))
+        estimator.advance(length, 0.0)
+        estimator.correct(position, settings.configured_covariance())
         estimate = estimator.estimate()
         law(estimate, length)
         if settings.steers_to_points:
             point_law(settings)(estimate, [0.0, 0.0, 1.0])
-            ahead = np.array([0.0, 0.0, 0.5 * settings.depth])
-            PathSteering(settings).command(estimate, self._plane, ahead, _FAR_AWAY, length)
+            end = np.array([0.0, 0.0, settings.depth])
+            PathSteering(settings).command(estimate, self._plane, end, _FAR_AWAY, length)
             path_planner(settings).warm_up()
 
 

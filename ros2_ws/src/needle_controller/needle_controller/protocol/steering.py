@@ -76,10 +76,8 @@ class Steering:
         self.state = SteeringState.IDLE
         self.awaiting = Awaiting.NOTHING
         self.reason = "not started"
-        self.starts = 0
-        self.step = 0
+        self.starts = self.step = self.watchdog_trips = 0
         self.rejection = ""
-        self.watchdog_trips = 0
         self.command_ns = 0
         self.insertion = 0.0
         self.reach: Reachability | None = None
@@ -372,10 +370,12 @@ class Steering:
         if gap > 0.0 and sample.is_near(before, settings.step_length + tolerance, math.inf):
             # Just a gap in the messages.
             return []
+        why = "joint_states are back"
         if gap < 0.0:
             self.tips.forget_stamps()
-        away = self._retraction.add_jump(before, sample, tolerance)
-        why = self._retraction.reason if away else f"the clock of joint_states went {gap:.4g} s"
+            why = f"the clock of joint_states went {gap:.4g} s"
+        if self._retraction.add_jump(before, sample, tolerance):
+            why = self._retraction.reason
         if not self._steering:
             return [Log("warning", why)]
         return self._leave(SteeringState.IDLE, why, "warning")

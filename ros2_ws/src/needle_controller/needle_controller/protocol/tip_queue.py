@@ -56,8 +56,8 @@ class TipQueue:
         self.after_ns = 0
         self._newest_rejected_ns = 0
         self._queue: list[Point] = []
-        self._head: Point | None = None
-        self._head_since = 0.0
+        # First tip of the queue, and the time since when [s].
+        self._head: tuple[Point, float] | None = None
         self._jumped: list[AcceptedTip] = []
 
     def add(
@@ -171,9 +171,12 @@ class TipQueue:
             Longest waiting time [s].
         """
         tip = next((tip for tip in self._queue if tip.stamp_ns > self.after_ns), None)
-        if tip is None or tip is not self._head:
-            self._head, self._head_since = tip, steady
-        if tip is None or steady - self._head_since < timeout:
+        if tip is None:
+            self._head = None
+            return None
+        if self._head is None or self._head[0] is not tip:
+            self._head = tip, steady
+        if steady - self._head[1] < timeout:
             return None
         if self.joints.at(tip.stamp_ns) is None:
             text = "no joint_states around the tip's stamp"

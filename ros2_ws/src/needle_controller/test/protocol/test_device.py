@@ -15,6 +15,7 @@ NOTHING = Awaiting.NOTHING
 
 def test_a_lost_answer_is_a_fault_without_motion() -> None:
     rig = Rig()
+    rig.steps(3)
     step = sent(rig.expose())
     timeout = rig.steering.settings.result_timeout
     # The timeout starts when the motion ends.
@@ -25,15 +26,15 @@ def test_a_lost_answer_is_a_fault_without_motion() -> None:
     rig.steering.on_device(HOLD)
     assert rig.steering.on_time(99.0 + 0.99 * timeout) == []
     (log,) = rig.steering.on_time(99.0 + timeout)
-    assert "no device/result for step 1 in 10 s" in logged([log])
+    assert "no device/result for step 4 in 10 s" in logged([log])
     assert state_of(rig) == (FAULT, NOTHING)
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_result(step.stamp_ns, "succeeded") == rig.expose() == []
     # A new start continues from the actual position.
-    rig.insertion = 0.0006
+    rig.insertion += 0.0006
     rig.settle(1)
     assert rig.start() == "steering"
-    assert sent(rig.expose()).insertion == pytest.approx(0.0016)
+    assert sent(rig.expose()).insertion == pytest.approx(0.0046)
 
 
 def test_a_slow_step_without_status_moving_is_not_a_lost_answer() -> None:

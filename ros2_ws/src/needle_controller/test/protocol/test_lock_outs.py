@@ -105,7 +105,7 @@ def test_after_a_joint_jump_the_needle_must_be_out_or_back(
     assert state_of(rig) == (IDLE, Awaiting.NOTHING)
     assert "withdraw the needle" in rig.start()
     rig.insertion, rig.rotation = deep - off, rig.rotation - turned
-    rig.settle(CONFIRMED_BY)
+    assert ("joint_states are back" in logged(rig.settle(CONFIRMED_BY))) is is_back
     assert (rig.start() == "steering") is is_back
     rig.steering.on_stop()
     rig.withdraw()
@@ -120,7 +120,7 @@ def test_steering_stops_when_the_clock_is_set_back_and_can_restart() -> None:
     assert rig.start() == "already steering"
     rig.steps(5)
     rig.now -= 50 * SECOND
-    assert "IDLE: the clock of joint_states went -" in logged(rig.settle(CONFIRMED_BY))
+    assert "IDLE: the clock of joint_states went -49.9 s" in logged(rig.settle(CONFIRMED_BY))
     assert rig.start() == "steering"
     rig.run(rig.good_tips())
     assert rig.steering.step == 6

@@ -14,7 +14,11 @@ from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import next_step
-from needle_controller.protocol.confidence import assess_confidence, point_miss_probability
+from needle_controller.protocol.confidence import (
+    Confidence,
+    assess_confidence,
+    point_miss_probability,
+)
 from needle_controller.protocol.joint_history import JointSample
 
 SETTINGS = SteeringSettings(depth=0.12)
@@ -70,6 +74,8 @@ def test_confidence_follows_from_covariance_and_miss_probability() -> None:
     ):
         found = assess_confidence(one, miss_probability)
         assert (found.verdict, found.is_doubtful) == (verdict, "doubtful" in verdict)
+    found = Confidence("trusted", False, -0.002, -0.0031, -0.0009)
+    assert found.summary == "r1 = -0.00200 m +- 0.00110 m (95 %), trusted"
 
 
 def test_the_miss_probability_of_a_point_is_its_frequency() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import pickle
 import re
 from collections.abc import Callable
 from typing import Any
@@ -220,15 +221,20 @@ def test_a_moving_point_is_reached_if_its_clock_is_known() -> None:
 
 
 def test_new_settings_keep_targets_and_obstacles_unless_they_change_them() -> None:
-    control = PlaneControl(PLANE)
+    control = PlaneControl(TO_PAST)
     control.plane = offset_plane(0.005)
     control.target_point, control.obstacles = np.array(POINT), WALL
-    control.configure(dataclasses.replace(PLANE, max_rotation_per_length=300.0))
+    # Equal settings are other objects.
+    same = pickle.loads(pickle.dumps(TO_PAST))
+    control.configure(dataclasses.replace(same, max_rotation_per_length=300.0))
     assert (control.plane.offset, control.obstacles) == (0.005, WALL)
     np.testing.assert_array_equal(control.target_point, POINT)
-    control.configure(dataclasses.replace(TO_PAST, target_offset=0.002))
-    assert (control.plane.offset, len(control.obstacles)) == (0.002, 1)
-    np.testing.assert_array_equal(control.target_point, PAST)
+    further = (*PAST[:2], 0.08)
+    control.configure(
+        dataclasses.replace(TO_PAST, target_offset=0.002, target_point=further, obstacles=())
+    )
+    assert (control.plane.offset, len(control.obstacles)) == (0.002, 0)
+    np.testing.assert_array_equal(control.target_point, further)
     control.configure(dataclasses.replace(PLANE, preset="paper"))
     assert control.target_point is None
 

@@ -106,10 +106,11 @@ def test_a_tip_timeout_ends_with_a_good_tip() -> None:
 
 def test_missing_inputs_are_named_after_the_tip_timeout() -> None:
     for covariance, cause in (
-        ("configured", "joint_states do not show the end of step 1"),
+        ("configured", "joint_states do not show the end of step 4"),
         ("from_tip_pose", "set it to configured"),
     ):
         rig = Rig(tip_covariance=covariance)
+        rig.steps(3 * (covariance == "configured"))
         actions = rig.expose()
         if covariance == "configured":
             rig.steering.on_result(sent(actions).stamp_ns, "succeeded")
@@ -171,16 +172,22 @@ def test_the_covariance_turns_with_the_plane(monkeypatch: pytest.MonkeyPatch) ->
         "rig", [0.0, 0.003, 0.0], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
     )
     calls = spied(rig, monkeypatch.setattr, "correct")
+    headings = spied(rig, monkeypatch.setattr, "correct_heading")
     rig.expose()
     rig.run(sent(rig.steering.on_tip_pose(covariance_at(rig))))
     rig.expose()
     matrix = np.diag([1.0, 4.0, 9.0]) * 1e-8
     matrix[0, 2] = matrix[2, 0] = 1e-8
-    sent(rig.steering.on_tip_pose(TipCovariance(rig.now, "rig", matrix)))
+    heading = np.array([0.6, 0.0, 0.8]), 1e-4
+    sent(rig.steering.on_tip_pose(TipCovariance(rig.now, "rig", matrix, heading)))
     wanted = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 9.0]]) * 1e-8
     # measurement_std^2 is added.
     wanted += rig.steering.settings.measurement_std**2 * np.eye(3)
     np.testing.assert_allclose(np.asarray(calls[0][1]), wanted, atol=1e-14)
+    # Headings within 10 mm repeat their error: ten steps count as one.
+    direction, variance = headings[0]
+    np.testing.assert_allclose(np.asarray(direction), [0.0, -0.6, 0.8], atol=1e-12)
+    assert variance == pytest.approx(1e-3)
 
 
 def test_a_tip_with_a_bad_covariance_is_rejected() -> None:

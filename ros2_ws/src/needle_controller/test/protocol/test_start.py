@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from needle_controller.model.target_plane import plane_from_pose
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_planner import PathPlanner
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -21,6 +22,7 @@ SETTINGS = SteeringSettings(target_offset=0.003, tip_covariance="configured")
 
 def test_start_reports_the_missing_device_state() -> None:
     bare = Steering(SETTINGS)
+    assert (bare.step, bare.insertion, bare.command_ns, bare.watchdog_trips) == (0, 0.0, 0, 0)
     assert "no device/status received" in bare.on_start()[0].message
     bare.on_device(HOLD)
     assert bare.on_start()[0].message == "no joint_states received"
@@ -63,6 +65,13 @@ def test_start_is_refused_for_an_inserted_or_rolled_needle() -> None:
     for degrees, started in ((79.0, True), (-79.0, True), (81.0, False), (-81.0, False)):
         reply = Rig(started=False, preset="paper", rotation=math.radians(degrees)).start()
         assert ("roll in target_plane" not in reply) is started, degrees
+    assert reply == (
+        "the needle's roll in target_plane is -1.41 rad (rotation_joint -1.414 rad), "
+        "must be within 1.4 rad"
+    )
+    rig = Rig(started=False, preset="paper")
+    rig.steering.control.plane = plane_from_pose("rig", [0.0] * 3, [0.0, 0.0, *[np.sqrt(0.5)] * 2])
+    assert "is -1.57 rad (rotation_joint 0 rad)" in rig.start()
     # Preset best has no limit.
     assert Rig(started=False, rotation=-8.0).start() == "steering"
 

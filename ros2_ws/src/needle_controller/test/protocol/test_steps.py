@@ -71,16 +71,17 @@ def test_without_hold_no_tip_is_used_and_after_it_a_fresh_one() -> None:
 
 def test_an_aborted_step_resumes_from_where_the_joints_are() -> None:
     rig = Rig()
+    rig.steps(3)
     step = sent(rig.expose())
     rig.steering.on_device(FREE)
     actions = rig.run(step, part=0.3, text="aborted: hold released")
-    assert logged(actions) == "step 1 aborted: hold released"
+    assert logged(actions) == "step 4 aborted: hold released"
     assert state_of(rig) == (STEERING, Awaiting.HOLD)
-    assert rig.steering.step == 0
+    assert rig.steering.step == 3
     assert rig.steering.reason == "step aborted: hold released"
     assert none_sent(rig.expose())
     rig.steering.on_device(HOLD)
-    assert sent(rig.expose()).insertion == pytest.approx(0.0003 + 0.001)
+    assert sent(rig.expose()).insertion == pytest.approx(0.0033 + 0.001)
 
 
 @pytest.mark.parametrize("answered_ns", [0, 10**18])

@@ -64,21 +64,15 @@ class DriveMachine:
         self._rest_counts = rest_counts
         self._period = period
         self._max_stop = math.ceil(stop_time / period) + _STOP_MARGIN
-        self._transitions = TransitionMonitor()
         self._goal = Goal.OFF
         self._cycles = 0
         self._switched_off_temporarily = False
-        self._stopping = False
-        self._still_cycles = 0
         self._cycles_in_stop = 0
         self._rested = True
         self._track: deque[int] = deque(maxlen=_WINDOW + 1)
-        self._ignores_stop = False
         self._sent_mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
         self.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
-        self.at = at
-        self.target = at.position
-        self.problem = ""
+        self.restart(at)
 
     @property
     def state(self) -> DriveState | None:

@@ -11,10 +11,9 @@ from needle_device_driver.link import objects as od
 from needle_device_driver.link.object_access import ObjectAccess, ObjectError
 from needle_device_driver.procedure import Procedure
 
-# Homing methods that use an index pulse, and a switch.
+# Homing methods that use an index pulse; the others to a switch are 17 to 30.
 INDEX_PULSE = (*range(1, 15), 33, 34)
-SWITCHES = tuple(range(1, 15)) + tuple(range(17, 31))
-HOMING_METHODS = (*SWITCHES, 33, 34, *PRESENT_POSITION_METHODS)
+HOMING_METHODS = (*INDEX_PULSE, *range(17, 31), *PRESENT_POSITION_METHODS)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -166,7 +166,7 @@ def _set_up_motion(
         (od.INTERPOLATION_PERIOD, round(period * 1e3), (round(period * 1e3),) * 2),
         (od.INTERPOLATION_EXPONENT, -3, (-3, -3)),
     ]
-    if settings.max_torque > 0.0:
+    if settings.max_torque:
         torque = round(settings.max_torque * 1e3)
         objects.append((od.MAX_TORQUE, torque, (torque // 2 + 1, 2 * torque)))
     missing = []

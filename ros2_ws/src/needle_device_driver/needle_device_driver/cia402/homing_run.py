@@ -14,7 +14,7 @@ from needle_device_driver.cia402.cia402 import (
     drive_state,
 )
 from needle_device_driver.cia402.drive_monitor import Feedback
-from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSettings
+from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link import objects as od
 
 # A drive may still report the previous homing as attained. If the new one ends within a cycle, at
@@ -57,11 +57,11 @@ class HomingRun:
     def __init__(self, settings: DriveSettings, speed: float, *, has_inputs: bool) -> None:
         self._settings = settings
         self.speed = speed
-        method = settings.homing_method
-        # An index pulse lies within one turn beyond the switch.
-        turn = (method in INDEX_PULSE) * settings.counts_per_turn
-        self._longest = settings.longest_search + turn / settings.counts_per_unit
-        self._towards, self._switch = _TOWARDS.get(method * has_inputs, (0, 0))
+        # An index pulse lies within one turn beyond the switch; without it, the turn is 0.
+        turn = settings.counts_per_turn / settings.counts_per_unit
+        self._longest = settings.longest_search + turn
+        towards = _TOWARDS.get(settings.homing_method) if has_inputs else None
+        self._towards, self._switch = towards or (0, 0)
         self._travelled = self._cycles_at_home = 0
         self.problem = ""
         self._reports_previous = False

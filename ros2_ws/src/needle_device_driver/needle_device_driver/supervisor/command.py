@@ -105,7 +105,7 @@ def check_command(
 def check_form(command: Trajectory) -> Problem | None:
     """Return the rule that a command breaks in every state of the device."""
     names, points = command.joint_names, command.points
-    if set(names) != {INSERTION_JOINT, ROTATION_JOINT} or len(names) != 2:
+    if sorted(names) != [INSERTION_JOINT, ROTATION_JOINT]:
         return Problem(
             Rule.COMMAND_FORM,
             f"joints {sanitize_list(names)}, expected {INSERTION_JOINT}, {ROTATION_JOINT}",
@@ -177,7 +177,7 @@ def _path(command: Trajectory, context: CommandContext) -> list[_Piece]:
     path = []
     for point in command.points:
         at = point.positions[insertion], point.positions[rotation]
-        if point.time_from_start > 0.0:
+        if point.time_from_start:
             path.append(_Piece(start, Leg(*at, point.time_from_start - before)))
         start, before = at, point.time_from_start
     return path

@@ -203,7 +203,7 @@ class RetractionBound:
         if insertion.homed or before is None:
             return
         if before.homed:
-            self._remaining = max(before.position, 0.0)
+            self._remaining = before.position
         elif before.origin == insertion.origin:
             self._remaining += insertion.position - before.position
 

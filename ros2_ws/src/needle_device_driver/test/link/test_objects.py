@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from pathlib import Path
@@ -55,6 +56,14 @@ def test_reverse_drive_swaps_its_limits() -> None:
     [
         ("insertion_homing_method", 36),
         ("rotation_node_id", 1),
+        ("insertion_node_id", 0),
+        # The id of the computer.
+        ("rotation_node_id", 127),
+        ("insertion_counts_per_turn", -0.1),
+        ("insertion_following_error_time", 0.0009),
+        ("insertion_following_error_time", 10.1),
+        ("insertion_max_torque", -0.1),
+        ("insertion_max_torque", 5.1),
         ("channel", ""),
         ("insertion_drive", "foot"),
         ("bitrate", 123_456),
@@ -63,6 +72,24 @@ def test_reverse_drive_swaps_its_limits() -> None:
 def test_invalid_parameter_is_refused(parameter: str, value: Any) -> None:
     with pytest.raises(UserError, match=parameter.removeprefix("insertion_")):
         DeviceDriverParameters(**{parameter: value})
+
+
+def test_parameters_of_a_drive_at_their_bounds() -> None:
+    given = {"node_id": 126, "following_error_time": 10.0, "max_torque": 5.0}
+    named = {f"rotation_{name}": value for name, value in given.items()}
+    drive = drive_settings(DeviceDriverParameters(**named), "rotation")
+    assert {name: getattr(drive, name) for name in given} == given
+    assert drive_settings(DeviceDriverParameters(), "rotation").node_id == 2
+
+
+def test_homing_methods_are_those_of_cia402_to_a_switch_an_index_pulse_or_here() -> None:
+    def is_known(method: int) -> bool:
+        with contextlib.suppress(UserError):
+            return bool(dataclasses.replace(DRIVE, homing_method=method))
+        return False
+
+    known = [method for method in range(-5, 40) if is_known(method)]
+    assert known == [*range(1, 15), *range(17, 31), 33, 34, 35, 37]
 
 
 def test_drive_bounds_follow_the_limits() -> None:

@@ -22,6 +22,16 @@ def command(stamp_ns: int, *points: tuple[float, float, float]) -> Trajectory:
     return Trajectory(stamp_ns, NAMES, way)
 
 
+def accepted(text: str) -> ServiceResult:
+    """Return the answer to a call that is executed."""
+    return ServiceResult(True, text)
+
+
+def rejected(text: str) -> ServiceResult:
+    """Return the answer to a call that is not executed."""
+    return ServiceResult(False, text)
+
+
 class SupervisorBench(abc.ABC):
     """Runs the cycles of a supervisor and records its events."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from .drive_bench import RAD, DriveBench
+from .supervisor_bench import rejected
 
 
 @pytest.mark.parametrize(("reverse", "sign"), [(False, 1), (True, -1)])
@@ -24,6 +25,9 @@ def test_steps_add_up_without_rounding_errors(reverse: bool, sign: int) -> None:
 
 def test_velocity_is_measured_over_the_last_cycle() -> None:
     bench = DriveBench().moving()
+    before = bench.axes[0].monitor.feedback.number
+    bench.go(3)
+    assert bench.axes[0].monitor.feedback.number == before + 3
     assert bench.axes[0].poll(bench.now).velocity == pytest.approx(0.002)
     assert bench.axes[1].poll(bench.now).velocity == pytest.approx(0.2, rel=2e-2)
 
@@ -32,7 +36,7 @@ def test_enable_and_home_wait_until_the_axes_are_off() -> None:
     bench = DriveBench().ready()
     bench.enable(False)
     for reply in (bench.enable(), bench.home()):
-        assert reply.message == "waiting for the axes to switch off"
+        assert reply == rejected("waiting for the axes to switch off")
     bench.wait(10)
     assert bench.enable().success
 

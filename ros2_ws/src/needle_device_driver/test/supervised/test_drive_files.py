@@ -102,17 +102,20 @@ FATAL, OPTIONAL = "NOT USABLE: ", "optional: "
     [
         ("605A", READ_ONLY, 1, FATAL + "fixed at 2"),
         ("1016sub1", READ_ONLY, 1, "drive_watchdog"),
+        ("1016sub1", {"DataType": "0x1B"}, 1, FATAL + "has 8 bytes"),
         ("605A", READ_ONLY | {"ParameterValue": "0x6"}, 0, "ok"),
         ("605A", {"AccessType": "const"}, 0, "unknown: read-only"),
         ("605B", READ_ONLY, 0, OPTIONAL + "fixed at 2"),
         ("60C2sub2", {"LowLimit": "-0x2"}, 1, FATAL + "-3 is outside [-2, None]"),
         ("60C2sub2", {"LowLimit": "0xFD"}, 0, "ok"),
         ("605A", {"DataType": "0x2"}, 0, "ok"),
+        ("605A", {"DataType": "word"}, 2, "quick stop option: 0 bytes, expected 2"),
         ("6085", {"HighLimit": "0x7FFFFFFF"}, 0, "ok"),
         ("6085", {"HighLimit": "1000"}, 1, FATAL + "10000000 is outside [None, 1000]"),
         ("607A", {"PDOMapping": "0"}, 1, FATAL + "0x1601:1 0x607A cannot be mapped"),
         ("60A9", {"DefaultValue": "0x10300"}, 1, "the drive measures speeds in m/s"),
         ("60A9", {"DefaultValue": "0xB44700"}, 0, "set *_counts_per_turn"),
+        ("60A9", {"DefaultValue": ""}, 0, "assumed: counts/s (0x60A9);"),
         ("6502", {"DefaultValue": ""}, 0, "does not list its cyclic synchronous position mode"),
         ("1000", {"DefaultValue": "401"}, 2, "node 1 has device profile 401, expected 402"),
         ("1000", {"DefaultValue": ""}, 0, "\nusable"),
@@ -143,6 +146,9 @@ def test_objects_are_those_that_canopen_reads(tmp_path: Path) -> None:
     sections["1800sub1"] |= {"DefaultValue": "$NODEID+0x180", "ParameterValue": "0x190"}
     sections["60C2sub2"] |= {"AccessType": "rww", "LowLimit": "0x80", "HighLimit": "63"}
     sections["6064"] |= {"LowLimit": "0xFFFFFF38", "HighLimit": "0xC8"}
+    # Boolean and 64 bits.
+    for name, kind in (("2000", "0x1"), ("2001", "0x15"), ("2002", "0x1B")):
+        sections[name] = sections["6064"] | {"DataType": kind}
     sections["1003"] = {"ParameterName": "Errors", "ObjectType": "0x8", "CompactSubObj": "3"}
     sections["1003"] |= {"DataType": "0x6", "AccessType": "ro", "DefaultValue": "7"}
     file = write(sections, tmp_path / "drive.dcf")

@@ -74,6 +74,7 @@ def fed(*ratio: int) -> Change:
 
 REFUSED: list[tuple[Change, str]] = [
     (reports({(0x1000, 0): 401}), "node 1 has device profile 401, expected 402"),
+    (reports({(0x1000, 0): 408}), "node 1 has device profile 408, expected 402"),
     (reports({(0x6502, 0): 0x205}), "node 1 has no homing mode (0x6502 = 0x00000205)"),
     (
         reports({(0x6502, 0): 0x225}) | has(modes={6}),
@@ -94,6 +95,9 @@ REFUSED: list[tuple[Change, str]] = [
     ),
     # Units other than counts and rpm.
     in_unit(0x60A9, 0xFD01_0300, "10^-3 m/s"),
+    in_unit(0x60A9, 0x0010_4700, "rad/min"),
+    in_unit(0x60A9, 0x00B4_0300, "turns/s"),
+    in_unit(0x60AA, 0x0041_5700, "deg/s^2"),
     in_unit(0x60A9, 0x7F77_9900, "10^127 unit 0x77 per unit 0x99"),
     in_unit(0x60AA, RPM, "rpm"),
     in_unit(0x60A8, 0xFFB5_0000, "10^-1 counts"),
@@ -129,6 +133,23 @@ def test_drive_without_a_required_object_or_value_is_refused(drive: Change, text
     assert bench.state == "FAULT"
 
 
+@pytest.mark.parametrize(
+    ("drive", "seconds"),
+    [
+        (has(state="enabled", ignored_orders={"off"}), 1.0),
+        (lacks(0x6502) | has(modes={8}), 0.5),
+        (has(beats=False), 1.0),
+    ],
+)
+def test_set_up_waits_a_limited_time(drive: Change, seconds: float) -> None:
+    bench = DriveBench()
+    change(bench.insertion, drive)
+    bench.sdo_time = 0.001
+    start = bench.now
+    bench.refusal()
+    assert seconds < bench.now - start < seconds + 0.3
+
+
 def no_types(types: bytes) -> Change:
     """Refuse transmission types of received PDOs."""
     lacking = types[:1], types[1:]
@@ -153,6 +174,8 @@ WIDTHS = {(0x605A, 0): 1, (0x6066, 0): 4, (0x60C2, 1): 2}
 TAKEN: list[Row] = [
     (has(), {(0x6065, 0): 10_000, (0x607D, 1): -20_000, (0x607D, 2): 4_020_000}, ""),
     units(COUNTS, COUNTS_2, {}, 1.0, 1.0),
+    # Dimensionless.
+    units(0x0300, 0x5700, {(0x60A8, 0): 0}, 1.0, 1.0),
     # 0.1 counts/s and 10 counts/s^2 (Copley).
     units(0xFFB5_0300, 0x01B5_5700, {}, 0.1, 10.0),
     units(RPM, RPM_S, TURN, 20_000 / 60, 20_000 / 60),

@@ -89,9 +89,12 @@ def test_drive_watchdog_is_disarmed_at_exit_by_a_drive_that_is_off() -> None:
     bench = DriveBench().moving()
     # A drive that does not report off keeps its watchdog.
     bench.insertion.syncs = False
+    before = len(bench.bus.sent)
     bench.run(bench.supervisor.deconfigure())
     assert bench.state == "FAULT"
     assert "insertion axis: does not confirm power-off" in bench.notices[-1].text
+    # The silent drive is given up after 16 cycles; the other one is at rest and off after five.
+    assert [cob for cob, _ in bench.bus.sent[before:]].count(0x80) == 16 + 5
     assert bench.insertion.value(0x1016, 1) == 127 << 16 | 100
     assert (bench.rotation.value(0x1016, 1), bench.rotation.state) == (0, "disabled")
     with pytest.raises(AxisError, match="insertion axis is not configured"):
@@ -141,8 +144,9 @@ def test_drive_emergency_that_persists_keeps_the_fault() -> None:
     bench.after(lambda: bench.insertion.fail(0x7121))
     bench.hold(False)
     bench.wait(5)
-    bench.sdo_time = 0.05
+    bench.sdo_time, before = 0.05, bench.now
     assert "the drive does not leave its fault: 0x7121 motor blocked" in bench.reset().message
+    assert 1.0 < bench.now - before < 1.5
     assert bench.state == "FAULT"
     # Only the edge counts: the last command was a reset already.
     bench.insertion.ignored_orders = set()

@@ -12,6 +12,7 @@ import pytest
 from needle_device_driver.rules import Rule
 
 from ..ideal_axes import Bench
+from ..supervisor_bench import accepted, rejected
 
 MS = 1_000_000
 
@@ -92,7 +93,7 @@ def test_hold_age_expired_press_does_not_block_reset() -> None:
     bench = Bench().ready()
     bench.supervisor.fail("test")
     bench.hold()
-    assert bench.reset().message == "release the hold first"
+    assert bench.reset() == rejected("release the hold first")
     bench.now += 0.25
     assert not bench.reset().success
     bench.now += 0.001
@@ -112,7 +113,8 @@ def test_hold_new_press_earlier_press_does_not_count(event: str) -> None:
         bench.press()
         assert bench.enable().success
     else:
-        assert (bench.reset() if event == "reset" else bench.supervisor.stop()).success
+        reply = bench.reset() if event == "reset" else bench.supervisor.stop()
+        assert reply == accepted("nothing to reset" if event == "reset" else "nothing moves")
     bench.go(5)
     assert (bench.status.hold_owner, bench.status.speed_scale) == ("", 0.0)
     assert bench.status.press_again == "a"
@@ -125,7 +127,8 @@ def test_hold_new_press_first_press_counts_only_without_session() -> None:
     bench = enabled()
     assert send_holds(bench, "b/s+") == "-"
     assert bench.rule == "hold_new_press"
-    assert bench.status.reason == "hold of 'b/s' ignored (hold_new_press)"
+    ignored = "hold of 'b/s' ignored (hold_new_press)"
+    assert (bench.status.reason, bench.status.text) == (ignored, ignored)
     # A message that is typed may have no stamp.
     assert send_holds(bench, "by_hand#0+") == "by_hand"
 
@@ -142,10 +145,11 @@ def test_hold_one_owner_remembers_sixteen_sources() -> None:
     bench = enabled()
     others = " ".join(f"s{number}-" for number in range(15))
     send_holds(bench, f"a- {others}")
-    bench.now += 0.25
-    send_holds(bench, others)
-    assert send_holds(bench, "late+") == "-"
-    assert bench.rule == "hold_one_owner"
+    for seconds in (0.0, 0.25):
+        bench.now += seconds
+        send_holds(bench, others)
+        assert send_holds(bench, "late+") == "-"
+        assert bench.rule == "hold_one_owner"
     bench.now += 0.001
     # It replaces only the source that was silent longest.
     assert send_holds(bench, "late+ late- s3+") == "late - s3"
@@ -262,8 +266,10 @@ def test_command_newer_stamps_are_used_once_and_a_reset_accepts_older_ones() -> 
     bench.step()
     assert bench.outcomes[-1].endswith("call device/reset to accept commands again")
     assert bench.reset().success
-    bench.go()
     bench.press()
+    bench.step()
+    assert bench.rule == "command_newer", "not newer than the reset"
+    bench.go()
     bench.step()
     assert bench.state == "MOVING"
     bench.supervisor.stop()

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from ..ideal_axes import Bench
-from ..supervisor_bench import PERIOD
+from ..supervisor_bench import PERIOD, accepted, rejected
 
 
 def test_coordinated_joints_are_in_proportion_at_any_speed() -> None:
@@ -24,20 +24,20 @@ def test_coordinated_joints_are_in_proportion_at_any_speed() -> None:
     bench.go()
     assert bench.positions == (0.001, -0.5)
     assert (bench.status.insertion_m, bench.status.rotation_rad) == bench.positions
+    assert (bench.status.reason, bench.status.text) == ("", "HOLDING")
     assert (bench.results, bench.state) == ([(stamp, "succeeded")], "HOLDING")
 
 
 @pytest.mark.parametrize(("which", "bound"), [("insertion", 0.0005), ("rotation", 0.1)])
 def test_following_error_bound_stops_both(which: str, bound: float) -> None:
-    for share, state in ((0.999, "MOVING"), (1.001, "FAULT")):
+    for share, state in ((0.999, "MOVING"), (1.002, "FAULT")):
         bench = Bench().moving()
         bench.axis(which).position -= share * bound
         bench.supervisor.drive(PERIOD, bench.now)
         assert bench.state == state, bench.status.fault
     assert bench.rule == "following_error"
-    limit = {"insertion": "limit 0.5 mm", "rotation": "limit 0.1 rad"}[which]
-    assert f"the {which} axis is" in bench.status.fault
-    assert bench.status.fault.endswith(limit)
+    off, limit = {"insertion": ("0.501 mm", "0.5 mm"), "rotation": ("0.100 rad", "0.1 rad")}[which]
+    assert bench.status.fault == f"the {which} axis is {off} off its set-point, limit {limit}"
     assert bench.insertion.orders[-2:] == bench.rotation.orders[-2:] == ["stop", "off"]
 
 
@@ -51,7 +51,10 @@ def test_settling_time_is_one_second(which: str) -> None:
     assert bench.state == "MOVING"
     bench.go(2)
     assert (bench.state, bench.rule) == ("FAULT", "settling_time")
-    assert "not at their target 1 s after the last set-point" in bench.status.fault
+    off = "0.0400 mm, rotation 0.00000" if which == "insertion" else "0.0000 mm, rotation 0.00400"
+    assert bench.status.fault == (
+        f"the axes are not at their target 1 s after the last set-point: insertion {off} rad off"
+    )
 
 
 # ---- retraction ---------------------------------------------------------------------------------
@@ -74,15 +77,15 @@ def inserted(*, homed: bool = True) -> Bench:
 def test_retraction_is_slow_without_rotation_and_needs_the_hold() -> None:
     bench = inserted()
     bench.insertion.powered = False
-    assert bench.retract().message == "the axes are not powered yet"
+    assert bench.retract() == rejected("the axes are not powered yet")
     bench.insertion.powered = True
     bench.hold(False)
-    assert bench.retract().message == "press the hold first and keep it pressed"
+    assert bench.retract() == rejected("press the hold first and keep it pressed")
     bench.hold()
     rotation = bench.rotation.position
     bench.rotation.orders.clear()
-    assert bench.retract().message == "retracting 3.0 mm while the hold lasts"
-    assert bench.retract().message == "the device is MOVING, not HOLDING"
+    assert bench.retract() == accepted("retracting 3.0 mm while the hold lasts")
+    assert bench.retract() == rejected("the device is MOVING, not HOLDING")
     bench.go(10)
     bench.hold(False)
     bench.wait(5)
@@ -92,7 +95,7 @@ def test_retraction_is_slow_without_rotation_and_needs_the_hold() -> None:
     bench.go(100)
     assert (bench.positions, bench.state) == ((0.0, rotation), "HOLDING")
     assert "move" not in bench.rotation.orders
-    assert bench.retract().message == "the needle is out"
+    assert bench.retract() == accepted("the needle is out")
 
 
 def test_retraction_ignores_inner_switch_and_rotation() -> None:
@@ -116,10 +119,22 @@ def test_unhomed_outward_only_by_the_last_known_depth() -> None:
     bench.go(40)
     # Only the remaining distance is allowed.
     bench.press()
-    assert bench.retract().message == "retracting 1.4 mm while the hold lasts"
+    assert bench.retract() == accepted("retracting 1.4 mm while the hold lasts")
     bench.go(100)
     assert bench.insertion.position == pytest.approx(-0.003)
-    assert bench.retract().message == "the needle is out"
+    assert bench.retract() == accepted("the needle is out")
+
+
+def test_unhomed_outward_only_to_home_if_it_was_lost_beyond_it() -> None:
+    bench = Bench().ready()
+    bench.insertion.position = -0.0005
+    bench.go()
+    bench.insertion.homed = bench.insertion.switch = False
+    bench.go()
+    assert bench.retract() == accepted("the needle is out")
+    bench.insertion.position = 0.001
+    bench.go()
+    assert bench.retract() == accepted("retracting 1.0 mm while the hold lasts")
 
 
 def test_unhomed_outward_only_to_the_switch_or_by_max_depth() -> None:
@@ -129,13 +144,13 @@ def test_unhomed_outward_only_to_the_switch_or_by_max_depth() -> None:
     bench.insertion.switch = True
     bench.go()
     assert bench.state == "HOLDING"
-    assert bench.retract().message == "the needle is out"
+    assert bench.retract() == accepted("the needle is out")
     bench = Bench(max_depth=0.1)
     bench.insertion.switch = False
     bench.configure()
     bench.enable()
     bench.hold()
-    assert bench.retract().message == "retracting 100.0 mm while the hold lasts"
+    assert bench.retract() == accepted("retracting 100.0 mm while the hold lasts")
 
 
 # ---- homing -------------------------------------------------------------------------------------
@@ -145,25 +160,25 @@ def test_homing_needle_out_needs_confirmation_until_the_next_step() -> None:
     bench = Bench()
     bench.configure()
     confirm = "confirm first that the needle is out (confirm_needle_out)"
-    assert bench.run(bench.supervisor.home(bench.now)).message == confirm
+    assert bench.run(bench.supervisor.home(bench.now)) == rejected(confirm)
     bench.ready()
-    assert bench.home().message == "the device is HOLDING, not DISABLED"
+    assert bench.home() == rejected("the device is HOLDING, not DISABLED")
     for length, is_out in ((-1.0, True), (0.001, False)):
         bench.step(length)
         assert bench.status.needle_out_confirmed is is_out, "one that is refused ends nothing"
     bench.enable(False)
-    assert bench.run(bench.supervisor.home(bench.now)).message == confirm
+    assert bench.run(bench.supervisor.home(bench.now)) == rejected(confirm)
 
 
 def test_homing_needle_out_can_be_stopped() -> None:
     bench = Bench()
     bench.insertion.position = 0.01
     bench.configure()
-    assert bench.home().message == "homing"
+    assert bench.home() == accepted("homing")
     assert bench.supervisor.may_move(bench.now), "without a hold"
     assert not bench.supervisor.confirm_needle_out(False).success
     bench.wait(5)
-    assert bench.supervisor.stop().message == "homing stopped"
+    assert bench.supervisor.stop() == accepted("homing stopped")
     bench.wait(5)
     assert bench.insertion.position == pytest.approx(0.01 - 5 * 0.002 * PERIOD)
     assert (bench.state, bench.insertion.powered) == ("DISABLED", False)
@@ -188,4 +203,5 @@ def test_homing_time_bound_of_each_axis(which: str, longest: float) -> None:
         assert bench.state == "MOVING"
         bench.wait(3)
         assert (bench.state, bench.rule) == ("FAULT", "homing_time")
-        assert f"the {which} axis did not find its home switch in" in bench.status.fault
+        text = f"the {which} axis did not find its home switch in {longest:.0f} s"
+        assert bench.status.fault == text

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ..ideal_axes import Bench
-from ..supervisor_bench import PERIOD
+from ..supervisor_bench import PERIOD, rejected
 
 SPEED = 0.005
 
@@ -54,6 +54,15 @@ def test_coordinated_path_replaces_another_without_a_stop() -> None:
     assert bench.results == [(first, "replaced"), (second, "succeeded")]
 
 
+def test_coordinated_path_may_have_a_knot_at_the_needle() -> None:
+    bench = Bench().ready()
+    straight(bench)
+    bench.go(10)
+    path(bench, (0.5, 0.0), (1.0, 0.0), (2.0, 0.2))
+    bench.go(5)
+    assert bench.positions == pytest.approx((0.0015, 0.1))
+
+
 def test_forward_only_path_that_ends_at_the_needle_moves_nothing() -> None:
     bench = Bench().ready()
     path(bench, (0.0, 0.0), (0.5, 0.1), (1.0, 0.1))
@@ -83,24 +92,25 @@ def test_max_rotation_rate_slows_the_insertion() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rule", "points"),
+    ("rule", "value", "points"),
     [
-        ("forward_only", [(0.001, 0.0, 0.2), (0.001, 0.0, 0.4), (0.0015, 0.0, 0.6)]),
-        ("max_speed", [(0.0005, 0.0, 0.09), (0.001, 0.0, 0.3), (0.0015, 0.0, 0.5)]),
-        ("max_rotation_step", [(0.0005, 0.7, 0.3), (0.001, 1.3, 0.6), (0.0015, 0.7, 0.9)]),
-        ("max_rotation_rate", [(0.0005, 0.0, 0.1), (0.001, -0.7, 0.3), (0.0015, -0.7, 0.5)]),
-        ("max_turns", [(0.0005, 0.4, 0.3), (0.001, 0.7, 0.6), (0.0015, 0.4, 0.9)]),
-        ("max_depth", [(0.001, 0.0, 0.3), (0.0017, 0.0, 0.6)]),
-        ("max_step_length", [(0.001, 0.0, 0.3), (0.0021, 0.0, 0.6)]),
+        ("forward_only", "before, 1 mm", [(1e-3, 0.0, 0.2), (1e-3, 0.0, 0.4), (2e-3, 0.0, 0.6)]),
+        ("forward_only", "before, 1 mm", [(1e-3, 0.0, 0.2), (9e-4, 0.0, 0.4), (2e-3, 0.0, 0.6)]),
+        ("max_speed", "5.54444", [(5e-4, 0.0, 0.09), (1e-3, 0.0, 0.3), (1.5e-3, 0.0, 0.5)]),
+        ("max_rotation_step", "1.3", [(5e-4, 0.7, 0.3), (1e-3, 1.3, 0.6), (1.5e-3, 0.7, 0.9)]),
+        ("max_rotation_rate", "3.4995", [(5e-4, 0.0, 0.1), (1e-3, -0.7, 0.3), (2e-3, -0.7, 0.5)]),
+        ("max_turns", "0.111408", [(5e-4, 0.4, 0.3), (1e-3, 0.7, 0.6), (1.5e-3, 0.4, 0.9)]),
+        ("max_depth", "1.7", [(1e-3, 0.0, 0.3), (1.7e-3, 0.0, 0.6)]),
+        ("max_step_length", "2.1", [(1e-3, 0.0, 0.3), (2.1e-3, 0.0, 0.6)]),
     ],
 )
 def test_each_piece_of_a_path_is_bounded(
-    rule: str, points: list[tuple[float, float, float]]
+    rule: str, value: str, points: list[tuple[float, float, float]]
 ) -> None:
     limits = {"max_turns": {"max_turns": 0.1}, "max_depth": {"max_depth": 0.0016}}
     bench = Bench(**limits.get(rule, {})).ready()
     bench.submit(*points)
-    bench.refused(rule)
+    assert f" {value}" in bench.refused(rule)
 
 
 def test_command_state_step_and_path_do_not_replace_each_other() -> None:
@@ -168,6 +178,9 @@ def test_command_form_path_must_not_begin_ahead_of_the_needle() -> None:
     # Up to the tolerance of the axes.
     path(bench, (0.001, 0.0), (1.1, 0.1), (1.5, 0.1))
     assert bench.state == "MOVING"
+    bench.go(5)
+    path(bench, (0.6, 0.0), (1.1, 0.1), (1.5, 0.1))
+    assert bench.outcomes[-1].endswith("at 0.6 mm, ahead of the needle at 0.5 mm")
 
 
 # ---- an insertion axis that a hand pushes -------------------------------------------------------
@@ -184,25 +197,6 @@ def push(bench: Bench, distance: float) -> None:
     bench.go()
 
 
-def test_coordinated_rotation_follows_a_pushed_needle() -> None:
-    bench = pushed()
-    path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.1))
-    bench.go()
-    farthest = 0.0
-    for distance in (1e-4, 3e-4, -2e-4, 4e-4, 5e-4, 3e-4):
-        push(bench, distance)
-        bench.go(3)
-        farthest = max(farthest, bench.positions[0])
-        wanted = np.interp(farthest, [0.0, 0.001, 0.002], [0.0, 0.3, 0.1])
-        assert bench.positions[1] == pytest.approx(wanted)
-    assert bench.status.reason == ""
-    assert "move" not in bench.insertion.orders
-    push(bench, 7e-4)
-    bench.go(3)
-    assert bench.outcomes == ["succeeded"]
-    assert "by hand" in bench.retract().message
-
-
 def test_max_rotation_rate_reports_a_fast_push_while_it_lasts() -> None:
     bench = pushed()
     path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
@@ -215,6 +209,10 @@ def test_max_rotation_rate_reports_a_fast_push_while_it_lasts() -> None:
     assert bench.status.rotation_owed_rad == 0.0
     assert bench.positions == pytest.approx((1.5e-3, 0.5))
     assert [notice.rule for notice in bench.notices].count(bench.notices[-1].rule) == 1
+    push(bench, 5e-4)
+    assert (bench.outcomes, "move" in bench.insertion.orders) == (["succeeded"], False)
+    by_hand = "the insertion axis is moved by hand: withdraw the needle by hand"
+    assert bench.retract() == rejected(by_hand)
 
 
 def test_hold_to_run_without_hold_a_push_turns_nothing() -> None:

@@ -7,7 +7,17 @@ from typing import Any
 
 import pytest
 
+from needle_core.diagnostics import Level
+from needle_core.status_messages import DeviceStatus
+
 from ..ideal_axes import Bench
+from ..supervisor_bench import accepted, rejected
+
+
+def test_nothing_is_reported_before_the_set_up() -> None:
+    at_start = DeviceStatus(level=Level.WARN, text="UNCONFIGURED", state="UNCONFIGURED")
+    bench = Bench()
+    assert (bench.status, bench.supervisor.stops) == (at_start, 0)
 
 
 def test_estop_latches_until_hold_release_and_reset() -> None:
@@ -19,13 +29,13 @@ def test_estop_latches_until_hold_release_and_reset() -> None:
     assert bench.outcomes == ["aborted: emergency stop"]
     assert (bench.status.fault, bench.status.level) == ("emergency stop", 2)
     bench.go()
-    assert bench.reset().message == "the emergency stop is still pressed"
+    assert bench.reset() == rejected("the emergency stop is still pressed")
     bench.supervisor.receive_estop(False)
     assert bench.state == "ESTOPPED"
     assert not bench.enable().success
-    assert bench.reset().message == "release the hold first"
+    assert bench.reset() == rejected("release the hold first")
     bench.hold(False)
-    assert bench.reset().message == "reset; enable to continue"
+    assert bench.reset() == accepted("reset; enable to continue")
     assert (bench.state, bench.status.fault) == ("DISABLED", "")
     bench.go(20)
     assert bench.positions == at
@@ -45,7 +55,8 @@ def test_estop_latches_from_every_state(state: str) -> None:
     bench.supervisor.fail("later")
     assert (bench.state, bench.status.fault) == ("ESTOPPED", "emergency stop")
     bench.supervisor.receive_estop(False)
-    assert bench.reset().success
+    reset = "enable to continue" if state != "UNCONFIGURED" else "the device is not configured"
+    assert bench.reset() == accepted(f"reset; {reset}")
     assert bench.state == ("UNCONFIGURED" if state == "UNCONFIGURED" else "DISABLED")
 
 
@@ -59,7 +70,7 @@ def test_one_device_refuses_everything_until_the_conflict_ends() -> None:
     bench.hold(False)
     for reply in (bench.enable(), supervisor.confirm_needle_out(True), bench.reset()):
         assert not reply.success
-    assert bench.reset().message == other
+    assert bench.reset() == rejected(other)
     supervisor.report_conflicting_device("")
     assert bench.state == "FAULT"
     assert bench.reset().success
@@ -108,7 +119,7 @@ def test_one_fault_stops_both_without_motion() -> None:
     assert bench.state == "FAULT"
     bench.hold(False)
     bench.rotation.unplugged = True
-    assert bench.reset().message == "rotation: no link"
+    assert bench.reset() == rejected("rotation: no link")
     bench.rotation.unplugged = False
     assert bench.reset().success
 
@@ -135,19 +146,22 @@ def test_reply_age_silent_axis_is_a_fault_without_joints(which: str) -> None:
 
 def test_disable_and_close_end_a_motion() -> None:
     bench = Bench().moving()
-    assert bench.enable(False).message == "disabled"
+    bench.insertion.unplugged = True
+    assert bench.enable(False) == rejected("insertion: no link")
+    bench = Bench().moving()
+    assert bench.enable(False) == accepted("disabled")
     assert bench.state == "DISABLED"
     assert bench.insertion.orders[-2:] == bench.rotation.orders[-2:] == ["stop", "off"]
     assert bench.outcomes == ["aborted: disabled on request"]
     assert bench.enable().success
-    assert bench.enable().message == "already enabled"
+    assert bench.enable() == accepted("already enabled")
     bench.press()
     bench.step()
     bench.run(bench.supervisor.deconfigure())
     assert bench.outcomes == ["aborted: disabled on request"] * 2
     assert bench.insertion.orders[-3:] == bench.rotation.orders[-3:] == ["stop", "off", "close"]
     assert (bench.state, bench.status.insertion_m) == ("UNCONFIGURED", None)
-    assert bench.enable().message == "the device is UNCONFIGURED, not DISABLED"
+    assert bench.enable() == rejected("the device is UNCONFIGURED, not DISABLED")
     bench.supervisor.fail("test")
     bench.run(bench.supervisor.deconfigure())
     assert bench.state == "FAULT"
