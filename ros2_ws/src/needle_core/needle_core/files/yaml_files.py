@@ -33,12 +33,12 @@ def read_yaml(path: Path) -> Any:
 
 
 def load_yaml(text: str) -> Any:
-    """Return the content of a YAML text.
+    """Return the content of a YAML document.
 
     Raises
     ------
     ValueError
-        If the text is not YAML, or a key is duplicate.
+        If the text is not YAML, or a key occurs twice.
     """
     try:
         return yaml.load(text, Loader=_Loader)
