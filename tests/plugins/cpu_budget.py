@@ -46,7 +46,7 @@ LAYERS = (
         "sequences and studies",
         re.compile(
             r"ros2_ws/src/"
-            r"(needle_tracker/test/(filter|calibrating)|.*/test/studies|.*/test_vision)"
+            r"(needle_tracker/test/(filter|calibrating)|.*/test/studies|.*/test_remote_tracker)"
         ),
         2.0,
     ),

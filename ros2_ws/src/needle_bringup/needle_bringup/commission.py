@@ -24,7 +24,7 @@ from needle_core.runners.virtual import DIAGNOSTICS, LOG
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import read_parameters
 from needle_device_driver.axes.axis import PERIOD
-from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
+from needle_device_driver.conformance.faults import FAULTS, Fault, can_satisfy, largest_travel
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig, RigClient
 from needle_device_driver.device import EMERGENCY_STOP
 from needle_device_driver.device_driver import DeviceDriver
@@ -140,7 +140,7 @@ class Bench(ConformanceRig):
 
 
 def commission(rig: ConformanceRig, ask: Ask, *, has_pedal: bool = False) -> Iterator[Row]:
-    """Run the commissioning; `ask` shows a text to the person and returns the answer.
+    """Run the commissioning; `ask` shows an instruction to the operator and returns the answer.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def commission(rig: ConformanceRig, ask: Ask, *, has_pedal: bool = False) -> Ite
     measured_mm = number("value", answer, 0.0, 1e3, "mm") if answer else math.nan
     error = abs(measured_mm - moved_mm) * 1e-3
     yield Row("counts_per_unit", "10 mm by hand", error, 0.01 * _DISTANCE)
-    faults = {fault.name: fault for fault in FAULTS if can_keep(fault.rule, rig.capabilities)}
+    faults = {fault.name: fault for fault in FAULTS if can_satisfy(fault.rule, rig.capabilities)}
     by_hand = _BY_HAND | (_WITH_PEDAL if has_pedal else {})
     for name in (name for name in (*_OWN, *_BY_HAND) if name in faults):
         _retract(rig)

@@ -256,7 +256,7 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class Text:
-    """A text."""
+    """Message of type std_msgs/String."""
 
     text: str
 

@@ -182,7 +182,7 @@ def packed(needle: LiveNeedle, now: float) -> bytes:
 
 
 def _role(name: str) -> str:
-    """Return target or entry if a name begins with it, else an empty text."""
+    """Return `target` or `entry` if a name begins with it, else an empty string."""
     return next((role for role in ("target", "entry") if name.casefold().startswith(role)), "")
 
 

@@ -94,7 +94,7 @@ def to_markers(needle: LiveNeedle, stamp_ns: int) -> m.Markers:
 
 
 def to_transforms(needle: LiveNeedle, stamp_ns: int) -> m.Transforms | None:
-    """Return the poses of plane, measured tip and the URDF's moving links; None without any."""
+    """Return the known poses of plane, measured tip and the URDF's moving links; None if none."""
     found = []
     if needle.plane is not None:
         found.append(_transform(needle.plane.T_rig_plane, RIG, TARGET_FRAME, stamp_ns))

@@ -162,7 +162,7 @@ class Run:
         return int(self.commands.received.min()) if len(self.commands) else None
 
     def joints_at(self, stamps: Stamps) -> Floats:
-        """Return interpolated joints, (N, 2) [m, rad], at ROS times [ns]; NaN without any."""
+        """Return interpolated joints, (N, 2) [m, rad], at ROS times [ns]; NaN if there are none."""
         if not len(self.joints):
             return np.full((len(stamps), 2), np.nan)
         start = self.joints.stamps[0]
@@ -170,11 +170,11 @@ class Run:
         return np.column_stack([np.interp(at, known, row) for row in self.joints.values.T])
 
     def insertion_at(self, stamps: Stamps) -> Floats:
-        """Return the insertion depth [m], (N,), at ROS times [ns]; NaN without any joints."""
+        """Return the insertion depth [m], (N,), at ROS times [ns]; NaN as in `joints_at`."""
         return self.joints_at(stamps)[:, 0]
 
     def last_status(self, key: str) -> str:
-        """Return the last value of a key of the controller status; empty without any."""
+        """Return the last value of a key of the controller status; empty if there is none."""
         for status in reversed(self.controller_status):
             if key in status.values:
                 return status.values[key]

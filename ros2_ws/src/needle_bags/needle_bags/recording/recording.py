@@ -187,7 +187,7 @@ class Recording:
         self._put(lambda: self._bag.add_metadata(name, values))
 
     def set_custom_data(self, key: str, value: str) -> None:
-        """Queue a text for metadata.yaml's `custom_data`."""
+        """Queue an entry of `custom_data` in metadata.yaml."""
         self._worker.put(lambda: self._bag.set_custom_data(key, value))
 
     def flush_idle(self) -> None:

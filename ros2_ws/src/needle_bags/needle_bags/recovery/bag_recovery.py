@@ -253,7 +253,7 @@ def _new_information(
 
 
 def _read_through(path: Path) -> BagDirectory:
-    """Read all messages of a bag; return it, closed."""
+    """Read all messages of a bag, and return the closed bag."""
     tqdm.monitor_interval = 0  # no monitor thread
     with BagDirectory(path) as bag:
         messages, total = bag.messages(lambda _: True), bag.counts.total()

@@ -288,7 +288,7 @@ def in_reception_order(
         for m in ordered
         if (m.topic, m.time) in received_at or m.time >= last.get(m.topic, 0)
     ]
-    # Equal times keep the order of sending.
+    # The sort is stable: messages with equal times keep the order of sending.
     return sorted(timed, key=lambda pair: pair[0])
 
 

@@ -132,7 +132,7 @@ class FieldResult:
     compared, differing : int
         Number of common messages, and of those that differ by more than the tolerance.
     largest : float
-        Largest difference, in `unit`; infinite if texts differ or only one value is a number.
+        Largest difference, in `unit`; infinite if strings differ or only one value is a number.
     first : int or None
         Stamp of the first differing message [ns].
     """

@@ -40,8 +40,8 @@ def describe(run: Run, comparison: Comparison) -> str:
             f"{field.topic} {field.field}",
             str(field.compared),
             str(field.differing),
-            _largest(field),
-            _where(run, field.first),
+            _largest_text(field),
+            _depth_text(run, field.first),
         )
         for field in comparison.fields
         if field.differing
@@ -153,20 +153,21 @@ def _missing(run: Run, topic: TopicResult) -> str:
     parts = []
     for stamps, words in ((topic.missing, "recorded only"), (topic.extra, "only today")):
         if stamps:
-            depths = ", ".join(_where(run, stamp) for stamp in stamps[:_SHOWN])
+            depths = ", ".join(_depth_text(run, stamp) for stamp in stamps[:_SHOWN])
             more = ", ..." if len(stamps) > _SHOWN else ""
             parts.append(f"  {topic.topic}: {len(stamps)} {words} (at {depths}{more})")
     return "\n".join(parts)
 
 
-def _largest(field: FieldResult) -> str:
+def _largest_text(field: FieldResult) -> str:
     if math.isinf(field.largest):
         return "not comparable" if field.unit else "not equal"
     unit = "" if field.unit in {"", "-"} else f" {field.unit}"
     return f"{field.largest:.3g}{unit}"
 
 
-def _where(run: Run, stamp: int | None) -> str:
+def _depth_text(run: Run, stamp: int | None) -> str:
+    """Return the insertion depth at a stamp, or the time if the depth is unknown."""
     if stamp is None:
         return ""
     depth = float(run.insertion_at(np.array([stamp], np.int64))[0]) * 1e3

@@ -157,12 +157,12 @@ class Player(WholeNode):
     def _make_publishers(self) -> None:
         for sender in self._senders.values():
             self.destroy_publisher(sender)
-        self._senders = {name: self._publisher(topic) for name, topic in self._topics.items()}
+        self._senders = {name: self._make_publisher(topic) for name, topic in self._topics.items()}
         if self._options.clock is not None:
             name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", alongside_rig=self.alongside_rig)
             self._senders[CLOCK] = self.create_publisher(Clock, name, RELIABLE)
 
-    def _publisher(self, topic: BagTopic) -> Publisher:
+    def _make_publisher(self, topic: BagTopic) -> Publisher:
         name = played_name(topic.name, topic.type_name, alongside_rig=self.alongside_rig)
         publisher = self.create_publisher(
             message_class(topic.type_name),

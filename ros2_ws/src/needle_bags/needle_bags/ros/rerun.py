@@ -296,7 +296,7 @@ def _viewers(
 
 
 def _viewer_counts(viewers: Mapping[str, BagStage]) -> str:
-    """Return one line per viewer, or an empty text if there are none."""
+    """Return one line per viewer, or an empty string if there are none."""
     lines = []
     for name, viewer in viewers.items():
         counts = ", ".join(f"{count} {what}" for what, count in viewer.runner.counts.items())

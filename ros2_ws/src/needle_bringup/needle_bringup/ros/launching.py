@@ -30,12 +30,12 @@ def describe(
         Launch arguments in addition to `namespace`, with default and description. A misspelt
         argument ends the launch.
     nodes : callable
-        Maps launch argument -> text to node -> parameter -> value; an exception ends the launch
-        before a node is started.
+        Receives the launch arguments, and returns the parameters by node; an exception ends the
+        launch before a node is started.
     choices : mapping
         Allowed values by argument.
     words : callable
-        Maps launch argument -> text to node -> further command line arguments.
+        Receives the launch arguments, and returns further command line arguments by node.
     """
     every = {**arguments, "namespace": ("", "namespace of all nodes")}
 

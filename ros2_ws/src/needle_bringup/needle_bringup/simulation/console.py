@@ -184,16 +184,16 @@ def _make_rig(parameters: Parameters) -> tuple[list[Component], dict[str, RealPo
 
     if parameters["sim_rig"]["level"] == "tip":
         return make_rig(parameters), {}
-    from needle_bringup.simulation.vision import (  # noqa: PLC0415
+    from needle_bringup.simulation.remote_tracker import (  # noqa: PLC0415
         VISION,
         RemoteTracker,
         make_vision,
     )
-    from needle_core.ports.worker import Worker  # noqa: PLC0415
+    from needle_core.ports.worker_process import WorkerProcess  # noqa: PLC0415
     from needle_sim.cameras import RemoteCameras  # noqa: PLC0415
 
     rig = make_rig(parameters, RemoteCameras, lambda _: RemoteTracker())
-    return rig, {VISION: Worker(make_vision, parameters)}
+    return rig, {VISION: WorkerProcess(make_vision, parameters)}
 
 
 def run_nodes(options: ConsoleOptions, rig: Parameters, end: ShutdownFlag) -> int:

@@ -18,7 +18,6 @@ from needle_core.component import Component, Exit
 from needle_core.errors import UserError
 from needle_core.runners import paced
 
-pytestmark = pytest.mark.usefixtures("compiled")
 Ends = Callable[["PlayedRunner"], bool]
 
 

@@ -24,7 +24,6 @@ from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_sim.sim_rig import SimRig
 from scenario.transport_faults import drop
 
-pytestmark = pytest.mark.usefixtures("compiled")
 SHORT = ("--level", "tip", "--depth-mm", "6")
 COMMANDS, HOLD, RESULTS, TIP = (
     "device/joint_trajectory",

@@ -57,7 +57,7 @@ class HoldProtocol:
     on_state : callable
         Receives the hold every `PERIOD` (`IDLE_PERIOD` without a page) and on each change.
     on_notice : callable
-        Receives texts for the log.
+        Receives lines for the log.
     now : float
         Time of the start.
     """

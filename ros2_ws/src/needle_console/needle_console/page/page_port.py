@@ -72,7 +72,7 @@ class PagePort:
                 self._snapshot = update
 
     def close(self) -> None:
-        """Do nothing: this port has no threads."""
+        """Do nothing: the threads belong to the servers of page and hold."""
 
     def _pop_events(self) -> tuple[PageEvent, ...]:
         """Return the events since the last call.

@@ -11,7 +11,7 @@ _MM = 1e3
 
 
 def readings(snapshot: Snapshot) -> dict[str, str]:
-    """Return the texts by label; the labels are always the same.
+    """Return the readings as text by label; the labels are always the same.
 
     Parameters
     ----------

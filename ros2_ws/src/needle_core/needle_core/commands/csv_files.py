@@ -12,7 +12,7 @@ from needle_core.files.yaml_files import read_text
 
 
 def read_rows(path: Path, columns: Iterable[str]) -> list[tuple[str, dict[str, str]]]:
-    """Return each row of a CSV file: its place, for messages, and its texts by column.
+    """Return each row of a CSV file: its place, for error messages, and its cells by column.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def read_rows(path: Path, columns: Iterable[str]) -> list[tuple[str, dict[str, s
 
 
 def read_lengths(path: Path, columns: tuple[str, ...]) -> dict[str, list[float] | None]:
-    """Return lengths [m] by name; None for a name without any.
+    """Return lengths [m] by name; None for a name whose cells are empty.
 
     Parameters
     ----------

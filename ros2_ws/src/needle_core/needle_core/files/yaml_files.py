@@ -41,12 +41,12 @@ def write_yaml(path: Path, content: Any, comments: Iterable[str]) -> None:
 
 
 def load_yaml(text: str) -> Any:
-    """Return the content of a YAML text.
+    """Return the content of a YAML document.
 
     Raises
     ------
     ValueError
-        If the text is not YAML, or a key is duplicate.
+        If the text is not YAML, or a key occurs twice.
     """
     try:
         return yaml.load(text, Loader=_Loader)

@@ -30,7 +30,7 @@ from needle_core.ros.base_node import full_name, spin_until
 
 # Time to discover all endpoints, to discover a given node or topic, and for an answer [s].
 DISCOVERY, SEARCH_TIMEOUT, ANSWER_TIMEOUT = 1.0, 5.0, 10.0
-MAX_LENGTH = 128  # of a printed array or text
+MAX_LENGTH = 128  # maximum number of printed elements of an array, or characters of a string
 
 
 # ---- messages ---------------------------------------------------------------------------------
@@ -46,7 +46,7 @@ def find_type(name: str, kind: str) -> Any:
 
 
 def to_plain(value: Any) -> Any:
-    """Return a message, or a field of one, as plain data; long texts and arrays are shortened."""
+    """Return a message, or a field of one, as plain data; long strings and arrays are shortened."""
     is_longer = hasattr(value, "__len__") and len(value) > MAX_LENGTH
     if isinstance(value, (str, bytes)):
         text = value if isinstance(value, str) else value.decode("latin-1")
@@ -91,7 +91,7 @@ def _converted(value: Any, type_name: str, stamps: list[Any]) -> Any:
         message = find_type(type_name, "msg")()
         stamps += fill(message, value)
         return message
-    # Other conversions, such as a text to a number, could hide a mistake.
+    # Other conversions, such as a string to a number, could hide a mistake.
     return float(value) if type_name in ("float", "double") and type(value) is int else value
 
 

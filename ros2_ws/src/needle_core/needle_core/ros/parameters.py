@@ -59,7 +59,7 @@ class NodeParameters(Generic[P]):
         self.values = from_values(parameters, given, node.get_fully_qualified_name())
         for name, spec, default in specs(parameters):
             value = list(default) if isinstance(default, tuple) else default
-            # ROS cannot infer the type of an empty list; lists of texts are dynamically typed.
+            # ROS cannot infer the type of an empty list; lists of strings are dynamically typed.
             empty = value == [] and not spec.texts
             if empty:
                 value = Parameter.Type.DOUBLE_ARRAY

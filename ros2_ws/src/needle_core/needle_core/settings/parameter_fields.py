@@ -27,11 +27,11 @@ class ParameterSpec:
     lower, upper : float
         Inclusive bounds of a number, or of each element of a list.
     choices : tuple of str
-        Allowed texts; if empty, any text is allowed.
+        Allowed strings; if empty, any string is allowed.
     read_only : bool
         Whether the value cannot change after the start.
     texts : bool
-        Whether the elements of a list are texts; otherwise they are numbers.
+        Whether the elements of a list are strings; otherwise they are numbers.
     """
 
     unit: str
@@ -69,8 +69,8 @@ def check_fields(parameters: Any) -> None:
     OutOfBoundsError
         If a number is outside its bounds.
     UserError
-        If a number is not finite, a text is not one of the choices, or a type differs from that of
-        the default.
+        If a number is not finite, a string is not one of the choices, or a type differs from the
+        default's.
     """
     for name, spec, default in specs(parameters):
         value = getattr(parameters, name)

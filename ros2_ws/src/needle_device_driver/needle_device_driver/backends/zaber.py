@@ -293,7 +293,7 @@ class ZaberProtocol(DriveProtocol):
     def _ask(
         self, target: tuple[int, int], text: str, *, is_optional: bool = False
     ) -> Procedure[str]:
-        """Send a command; return its data, or an empty text for a refused optional one."""
+        """Send a command; return its data, or an empty string for a refused optional one."""
         self._ask_id = self._ask_id % _CYCLIC_IDS + 1
         message_id = 2 * _CYCLIC_IDS + self._ask_id
         message = _message(target, message_id, text)

@@ -96,8 +96,8 @@ _NEEDS = {
 }
 
 
-def can_keep(rule: Rule, drive: Capabilities) -> bool:
-    """Return whether drives are able to keep a rule."""
+def can_satisfy(rule: Rule, drive: Capabilities) -> bool:
+    """Return whether drives are able to satisfy a rule."""
     return all(getattr(drive, need) for need, rules in _NEEDS.items() if rule in rules)
 
 

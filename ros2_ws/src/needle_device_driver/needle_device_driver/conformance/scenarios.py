@@ -11,7 +11,7 @@ from needle_core.component import Call
 from needle_device_driver.axes.axis import PERIOD, AxisError
 from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.conformance import checks
-from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
+from needle_device_driver.conformance.faults import FAULTS, Fault, can_satisfy, largest_travel
 from needle_device_driver.conformance.rig import AXES, DRIVER, ConformanceRig
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.rules import Rule
@@ -333,7 +333,7 @@ RULES = tuple(rule for rule in Rule if rule in {*SCENARIOS, *(fault.rule for fau
 
 
 def verdict(rule: Rule, drive: Capabilities, limits: Any) -> str:
-    """Return how drives keep a rule: enforced, within a bound, or not at all.
+    """Return how drives satisfy a rule: fully, by the driver alone, within a bound, or not at all.
 
     Parameters
     ----------
@@ -345,7 +345,7 @@ def verdict(rule: Rule, drive: Capabilities, limits: Any) -> str:
         Parameters of the driver.
     """
     faults = (fault for fault in FAULTS if fault.rule is rule)
-    if not can_keep(rule, drive):
+    if not can_satisfy(rule, drive):
         return IMPOSSIBLE
     if rule is Rule.SOFTWARE_LIMITS and not drive.limits:
         return "driver only"

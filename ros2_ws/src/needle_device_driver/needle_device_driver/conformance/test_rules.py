@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 from needle_device_driver.axes.backend import HAND
-from needle_device_driver.conformance.faults import FAULTS, can_keep
+from needle_device_driver.conformance.faults import FAULTS, can_satisfy
 from needle_device_driver.conformance.plugin import ROW
 from needle_device_driver.conformance.rig import ConformanceRig
 from needle_device_driver.conformance.scenarios import (
@@ -36,7 +36,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.value)
 def test_rule(axis: str, rule: Rule, record_property: Callable[[str, object], None]) -> None:
-    """Check that the drives keep a rule as far as their abilities allow."""
+    """Check that the drives satisfy a rule as far as their abilities allow."""
     make = partial(ConformanceRig, 1, axis=axis)
     rig = make()
     text = verdict(rule, rig.capabilities, rig.settings)
@@ -49,5 +49,5 @@ def test_fault_at_a_random_moment(axis: str, moment: int) -> None:
     """Cause each fault in turn at a random moment of set-up, homing, steps or rest."""
     make = partial(ConformanceRig, moment, axis=axis)
     fault = FAULTS[moment % len(FAULTS)]
-    if can_keep(fault.rule, make().capabilities):
+    if can_satisfy(fault.rule, make().capabilities):
         random_moment(fault, make, moment)

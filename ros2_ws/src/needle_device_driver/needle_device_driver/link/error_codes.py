@@ -1,4 +1,4 @@
-"""Texts of error codes: SDO aborts (CiA 301), drive errors (CiA 301, CiA 402)."""
+"""Descriptions of error codes: SDO aborts (CiA 301), drive errors (CiA 301, CiA 402)."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ _ERROR_CLASSES = {
 
 
 def describe_abort(code: int) -> str:
-    """Return the abort code of an SDO transfer with its text."""
+    """Return the abort code of an SDO transfer with its description."""
     text = _ABORTS.get(code)
     return f"Code 0x{code:08X}" + (f", {text}" if text else "")
 
 
 def describe_error(code: int) -> str:
-    """Return a drive's error code (EMCY's first two bytes, or 0x603F) with its text."""
+    """Return a drive's error code (EMCY's first two bytes, or 0x603F) with its description."""
     text = _ERRORS.get(code) or _ERROR_CLASSES.get(code >> 12, "unknown error")
     return f"0x{code:04X} {text}"

@@ -28,7 +28,7 @@ SLCAN_BITRATES = (
 # Longest time to connect to a server, and for each of its replies [s].
 _CONNECT_TIMEOUT = 1.0
 _REPLY_TIMEOUT = 1.0
-# Longer texts are noise [bytes].
+# Longer lines [bytes] are noise.
 _MAX_TEXT = 64
 _MAX_READ = 4096
 
@@ -105,12 +105,12 @@ class TextBus(abc.ABC):
 
     @abc.abstractmethod
     def _decode(self, text: str) -> Message | None:
-        """Return the frame in a text, None if it has none.
+        """Return the frame in a line, None if it has none.
 
         Raises
         ------
         ValueError, IndexError
-            If the text is malformed.
+            If the line is malformed.
         """
 
     def _write(self, text: str) -> None:

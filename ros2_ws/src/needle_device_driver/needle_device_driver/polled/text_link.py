@@ -54,7 +54,7 @@ class StreamPort(BytePort):
         return _Serial(self._address, self._baudrate, self._timeout)
 
 
-# Longer lines are noise or data of another program [bytes].
+# Longer lines [bytes] are noise or data of another program.
 _LONGEST_LINE = 1024
 
 

@@ -83,8 +83,8 @@ class PtyCan:
                 return ()
             result = self._adapter.feed(data)
             if result.closed:
-                # The next program closes the channel before it opens it, and must not read output
-                # for the previous one. Flushing at the opening would be too late.
+                # A program first closes the channel, then opens it. Discard output for the
+                # previous program at the close: at the opening, the new one may have read it.
                 self._pending = b""
                 termios.tcflush(self._slave, termios.TCIFLUSH)
             self._write(result.reply)

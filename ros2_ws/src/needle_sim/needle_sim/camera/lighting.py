@@ -60,7 +60,7 @@ def drift(lighting: Lighting, exposure_number: int, phase: float) -> float:
 
 
 def flicker(glints: Glints, exposure_number: int, phase: float) -> float:
-    """Return the factor of the surface glints in an exposure."""
+    """Return the factor by which the surface glints dim; `phase` is the initial one [rad]."""
     angle = 2.0 * np.pi * exposure_number / _FLICKER_PERIOD + phase
     return float(1.0 - glints.flicker * (0.5 + 0.5 * np.sin(angle)))
 

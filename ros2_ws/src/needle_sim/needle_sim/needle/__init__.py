@@ -1,1 +1,1 @@
-"""Needle on SE(3) in tissue."""
+"""Simulated needle: motion of its tip on SE(3), torsion in tissue, and visible shape."""

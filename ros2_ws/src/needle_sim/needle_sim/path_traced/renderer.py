@@ -254,7 +254,7 @@ class PathTracedRenderer:
         veil = float(np.median(floor))
         clear = np.where(rays.in_air, 1.0, _transmission(appearance.haze, 1.0))
         floor = np.asarray(clear * floor + (1.0 - clear) * veil, dtype=np.float32)
-        # Clouded gel scatters light from all sides, little of it over a dark floor.
+        # Cloudy gel scatters light from all sides; over a dark floor there is little of it.
         Marks(self._world).draw(floor, optics, 0.4 * float(np.median(self._light[behind])) + veil)
 
         view = dataclasses.replace(view, veil=veil, floor=floor)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 
 from needle_core.component import RealPort
-from needle_core.ports.worker import Worker
+from needle_core.ports.worker_process import WorkerProcess
 from needle_core.ros.main import run_component
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
@@ -42,7 +42,7 @@ def _ports(settings: SimRigParameters) -> Mapping[str, RealPort]:
         return {}
     from needle_sim.cameras import CAMERAS, make_renderer  # noqa: PLC0415
 
-    return {CAMERAS: Worker(make_renderer, settings)}
+    return {CAMERAS: WorkerProcess(make_renderer, settings)}
 
 
 def main() -> int:

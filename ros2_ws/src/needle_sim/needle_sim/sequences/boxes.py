@@ -21,7 +21,7 @@ _WALLS, _ACRYLIC = (0.003, 0.008), (1.485, 1.495)  # thickness [m], refractive i
 _GEL = (1.33, 1.42)
 _TILT = 0.005  # standard deviation of a wall's tilt [rad]
 _BEFORE_ENTRY_PX = (15.0, 70.0)  # distance of the needle's entry from the image border
-_MAX_OFFSET = 0.012  # of a camera from the centre of its view [m]
+_MAX_OFFSET = 0.012  # maximum distance of a camera from the centre of its view [m]
 _ROLL = 0.03  # standard deviation of a camera's roll [rad]
 
 

@@ -54,7 +54,8 @@ class EndFitSettings:
 
 
 FIT = EndFitSettings()
-_ROUNDING = 1e-9  # includes the end of a range of positions [px]; least sum of probabilities
+_ROUNDING_PX = 1e-9  # makes np.arange include the end of a range of positions
+_LEAST_MASS = 1e-9  # least sum of probabilities, to avoid a division by zero
 _ONE_SIGMA = 0.5 * (1.0 + math.erf(math.sqrt(0.5)))  # share of a normal distribution below 1 sigma
 
 
@@ -129,7 +130,7 @@ def fit_end(
     rough = _fit_line(shaft, axes, line, end=0.0, back=back, width=width)
     if rough is None:
         return _lone_end(shaft, ends, axes, back, width) if lone else None
-    # The second fit is centred on the end that the first one leads to.
+    # The second fit is centred on the end that the first one found.
     end, _ = _end_on_line(ends, axes, rough.line, along, width)
     fitted = _fit_line(shaft, axes, rough.line, end=end, back=back, width=width)
     if fitted is None:
@@ -216,7 +217,7 @@ def _best_line(shaft: Map, axes: Axes, back: float, across: float, width: float)
     leans = math.ceil(FIT.largest_slope * back / pitch)
     offsets = pitch * np.arange(-steps, steps + 1)
     slopes = FIT.largest_slope / leans * np.arange(-leans, leans + 1)
-    along = np.arange(-back, _ROUNDING, pitch, dtype=np.float64)
+    along = np.arange(-back, _ROUNDING_PX, pitch, dtype=np.float64)
     lines = offsets[:, None, None] + slopes[:, None] * along
     sums = axes.sample(shaft, along, lines).sum(axis=-1)
     best = np.unravel_index(sums.argmax(), sums.shape)
@@ -231,14 +232,14 @@ def _fit_line(
     None is returned for a shaft that is too short.
     """
     along = end - np.arange(int(back), dtype=np.float64)
-    beside = np.arange(-width, width + _ROUNDING, 0.5)
+    beside = np.arange(-width, width + _ROUNDING_PX, 0.5)
     values = axes.sample(shaft, along[:, None], line.at(along)[:, None] + beside)
     mass = values.sum(axis=1)
     weights = np.minimum(0.5 * mass / width, 1.0)
     total = float(weights.sum())
     if total < max(FIT.least_line_widths * width, 2.0):
         return None
-    shares = values / np.maximum(mass, _ROUNDING)[:, None]
+    shares = values / np.maximum(mass, _LEAST_MASS)[:, None]
     shifts = shares @ beside
     breadth = float(weights @ (shares @ beside**2 - shifts**2)) / total
     middles = line.at(along) + shifts
@@ -269,7 +270,7 @@ def _end_on_line(
     """
     count = 2 * int(along) + 1
     positions = np.arange(count, dtype=np.float64) - along
-    beside = np.arange(-width, width + _ROUNDING)
+    beside = np.arange(-width, width + _ROUNDING_PX)
     lines = line.at(positions)[:, None] + beside
     density = axes.sample(ends, positions[:, None], lines).sum(axis=1)
     # A wide window may show two ends, and their median would be at neither.

@@ -300,7 +300,15 @@ class NeedleDetector:
         return self._shrunk[shrink]
 
     def _evidence(self, shrink: int, box: tuple[int, ...]) -> Window:
-        """Return the maps of a box: first column and row, end column and row."""
+        """Return the maps of a box with its margin.
+
+        Parameters
+        ----------
+        shrink : int
+            Factor by which the image is shrunk.
+        box : tuple of int
+            First column and row, and the column and row after the last, in the shrunk image.
+        """
         image = self._at(shrink)
         height, width = image.shape
         x0, y0 = max(box[0] - MARGIN_PX, 0), max(box[1] - MARGIN_PX, 0)

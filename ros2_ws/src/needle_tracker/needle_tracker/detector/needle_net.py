@@ -78,7 +78,7 @@ class NeedleNet:
             Expected number of needle ends in each pixel, which may be summed over an area.
         """
         height, width = image.shape
-        padded = np.zeros((1, 2, _padded(height), _padded(width)), np.float32)
+        padded = np.zeros((1, 2, _padded_size(height), _padded_size(width)), np.float32)
         padded[0, 0, :height, :width] = image
         if background is not None:
             padded[0, 1, :height, :width] = background
@@ -87,5 +87,5 @@ class NeedleNet:
         return shaft[0, 0, :height, :width], np.exp(log_ends[0, 0, :height, :width])
 
 
-def _padded(size: int) -> int:
+def _padded_size(size: int) -> int:
     return -(-size // _MULTIPLE) * _MULTIPLE

@@ -252,7 +252,7 @@ class NeedleTrack:
         if travel is None:
             travel = math.dist(tip.position, self.rest_position)
         independent = min(abs(travel) / FILTER.evidence_length, 1.0)
-        # Images of nearly the same needle are repeated readings of one evidence: their mean counts.
+        # Images of nearly the same needle repeat the same evidence: use their mean.
         weight = max(1.0 / (self.sightings + 1), independent)
         length = self.length_log_odds
         if sighting.length is not None:

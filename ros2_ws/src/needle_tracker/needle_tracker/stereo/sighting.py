@@ -138,7 +138,7 @@ class StereoSearch:
         return [], (one, other)
 
     def _ends(self, side: int, grid: SearchGrid, shaft: Shaft, *, hidden: bool) -> list[ImageEnd]:
-        """Return the ends near that of a shaft, in the left (0) or the right (1) image."""
+        """Return the ends near the end of a shaft, in the left (0) or the right (1) image."""
         cells = shaft.cells[-PAIRING.direction_rows :]
         pixels = grid.views[side].pixels[cells].astype(np.float64)
         # Means of both halves smooth the steps of the cells.
@@ -150,7 +150,7 @@ class StereoSearch:
     def _sightings(
         self, grid: SearchGrid, shaft: Shaft, least: float, most: float
     ) -> Iterator[Sighting]:
-        """Yield the pairs of ends near that of a shaft that can be those of the needle."""
+        """Yield the pairs of ends, near the end of a shaft, that are possible for the needle."""
         # The first tip of a short needle may come from the end in one view and the shaft in both.
         hidden = most < 2.0 * self.settings.entry_zone
         left = self._ends(0, grid, shaft, hidden=hidden)
@@ -199,13 +199,13 @@ class StereoSearch:
 
 
 def evidence(ends: tuple[ImageEnd, ImageEnd], tip: SpatialTip) -> float:
-    """Return the log-odds that two ends are that of one shaft, from the network and the misfit."""
+    """Return the log-odds that two ends are of one shaft, from the network and the misfit."""
     seen = sum(_log_odds(end.ends) + PAIRING.shaft_weight * _log_odds(end.shaft) for end in ends)
     return seen - 0.5 * tip.misfit
 
 
 def _distinct(sightings: Iterable[Sighting]) -> list[Sighting]:
-    """Return the first sighting of each end, which has the best path, in order of evidence."""
+    """Return one sighting of each end, the first given, sorted by decreasing evidence."""
     kept: list[Sighting] = []
     for each in sightings:
         if all(_is_other(each.tip, one.tip) for one in kept):

@@ -18,9 +18,10 @@ from needle_tracker.optics.refraction import RefractedCamera
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
-_ROUNDING = 1e-10  # step of a converged position [m]; scaled determinant of a singular matrix
+_CONVERGED = 1e-10  # step below which a position has converged [m]
+_SINGULAR = 1e-10  # scaled determinant below which a matrix counts as singular [-]
 _LEAST_SINE = 1e-3  # least sine of the angle between the planes through a camera and the shaft
-_LARGEST_VARIANCE = 1.0  # of a direction that is determined [-]
+_LARGEST_VARIANCE = 1.0  # largest total variance of a determined direction [-]
 _IMAGE_AXES, _EQUAL = np.stack([np.eye(2)] * 2), np.ones((2, 2))
 
 
@@ -33,7 +34,8 @@ class SpatialTip:
     position : ndarray, shape (3,)
         Visible end [m].
     covariance : ndarray, shape (3, 3)
-        Covariance of the position [m^2].
+        Covariance of the position [m^2]: of the fit alone, or of a published tip with the errors
+        that persist from pair to pair (`NeedleTracker`).
     direction : ndarray, shape (3,)
         Unit vector along the visible shaft near the tip, towards the tip.
     direction_covariance : ndarray, shape (3, 3)
@@ -128,11 +130,11 @@ def locate(
         residuals = (np.einsum("vij,vj->vi", axes, off) / sigmas).ravel()
         normal = rows.T @ rows
         # Scaled by its diagonal, the determinant shows how well the position is determined.
-        if not np.linalg.det(normal) > _ROUNDING * np.prod(np.diag(normal)):
+        if not np.linalg.det(normal) > _SINGULAR * np.prod(np.diag(normal)):
             return None
         step = np.linalg.solve(normal, rows.T @ residuals)
         position = position + step
-        if np.abs(step).max() < _ROUNDING:
+        if np.abs(step).max() < _CONVERGED:
             return position, np.linalg.inv(normal), residuals
     return None
 

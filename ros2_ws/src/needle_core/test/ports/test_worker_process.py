@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 
 from needle_core.component import PortChange
-from needle_core.ports import worker as module
-from needle_core.ports.worker import Worker
+from needle_core.ports import worker_process as module
+from needle_core.ports.worker_process import WorkerProcess
 
 TIMEOUT = 60.0  # [s]
 ENDED = PortChange("the worker process has ended")
@@ -28,7 +28,7 @@ class Calls:
     """Worker that calls its items, and the queue of what arrives."""
 
     def __init__(self) -> None:
-        self.port = Worker(methodcaller, "__call__")
+        self.port = WorkerProcess(methodcaller, "__call__")
         self.arrived: SimpleQueue[Any] = SimpleQueue()
         self.port.open(self.arrived.put)
 
@@ -92,8 +92,8 @@ def test_a_close_kills_a_process_that_hangs(calls: Calls, monkeypatch: pytest.Mo
 PARENT = """
 import os, sys
 from operator import methodcaller
-from needle_core.ports.worker import Worker
-worker = Worker(methodcaller, "__call__")
+from needle_core.ports.worker_process import WorkerProcess
+worker = WorkerProcess(methodcaller, "__call__")
 worker.open(lambda batch: print(*batch, flush=True))
 worker.send((os.getpid,))
 sys.stdin.read()

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from needle_bringup.simulation.remote_tracker import VISION, RemoteTracker, make_vision
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import parse
-from needle_bringup.simulation.vision import VISION, RemoteTracker, make_vision
 from needle_core import messages as m
 from needle_core.component import Exit, Moment, PortChange, Publish, Send
 from needle_sim.bench import SimulatedBench

@@ -20,7 +20,7 @@ _CLOSE_TIMEOUT = 2.0
 _END = object()
 
 
-class Worker:
+class WorkerProcess:
     """Port to a process that applies a function to each item of a batch, one after the other.
 
     Each result arrives as a batch of one item. If the process ends by itself, because of an
