@@ -299,7 +299,10 @@ class NeedleTracker:
         if tip is None or not track.fits(tip, self.settings):
             return None
         sighting = Sighting(tip, pair, evidence(pair, tip))
-        return sighting if sighting.evidence > 0.0 else None
+        # Ends that both views show where the insertion predicts them need less evidence.
+        are_visible = min(end.ends for end in pair) > FIT.hidden_end
+        needed = -track.length_log_odds if are_visible else 0.0
+        return sighting if sighting.evidence > needed else None
 
     def _answer(
         self, sighting: Sighting | None, reason: str, ends: Ends = (None, None)

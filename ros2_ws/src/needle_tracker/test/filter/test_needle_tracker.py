@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import sys
 from collections.abc import Callable
@@ -16,10 +17,13 @@ from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_tracker.detector.end_fit import FIT
+from needle_tracker.filter import needle_tracker
 from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.filter.settings import FILTER
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.stereo.sighting import Ends, Sighting, StereoSearch
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
@@ -209,6 +213,36 @@ def test_without_an_encoder_a_needle_is_found_near_an_old_track(
             assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
     assert set(reasons[:2]) == {NoTip.UNCONFIRMED}
     assert reasons[-2:] == ["", ""]
+
+
+@pytest.mark.parametrize(
+    ("is_known", "hidden_end", "searches"),
+    [(True, FIT.hidden_end, 1), (False, FIT.hidden_end, 2), (True, 9.0, 2)],
+    ids=["predicted", "without insertion", "hidden"],
+)
+def test_visible_ends_need_less_evidence_where_the_insertion_predicts_them(
+    tracker: NeedleTracker,
+    draw_pair: Drawer,
+    monkeypatch: pytest.MonkeyPatch,
+    is_known: bool,
+    hidden_end: float,
+    searches: int,
+) -> None:
+    searched: list[float] = []
+    search = StereoSearch.search
+
+    def counted(self: StereoSearch, least: float, most: float) -> tuple[list[Sighting], Ends]:
+        searched.append(most)
+        return search(self, least, most)
+
+    monkeypatch.setattr(StereoSearch, "search", counted)
+    monkeypatch.setattr(needle_tracker, "evidence", lambda *_: -2.0)
+    monkeypatch.setattr(needle_tracker, "FIT", dataclasses.replace(FIT, hidden_end=hidden_end))
+    for length in (0.060, 0.061):
+        pair = draw_pair(arc(length, 8.0, 0.3))
+        measured = tracker.process(*pair, length if is_known else None)
+    assert measured.tip is not None
+    assert len(searched) == searches
 
 
 def test_a_black_image_is_reported(tracker: NeedleTracker, draw_pair: Drawer) -> None:
