@@ -20,7 +20,8 @@ from needle_bags.reading.bag_reader import Run, read_run
 from needle_bags.ros.rerun import Node
 from needle_core.component import Actions, Moment, Publish
 from needle_core.convert import from_ros
-from needle_core.messages import Image, JointState, Pose, quaternion_from_rotation
+from needle_core.messages import Image, JointState, Pose
+from needle_core.rotations import quaternion_from_rotation
 from needle_sim.bench import SimulatedBench
 from needle_sim.cameras import CameraSensor
 from needle_sim.sim_rig_parameters import SimRigParameters

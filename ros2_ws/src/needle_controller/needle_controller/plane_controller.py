@@ -11,7 +11,7 @@ import numpy as np
 
 from needle_controller.controller_status import controller_status
 from needle_controller.model.arrays import Array
-from needle_controller.model.kinematics import angle_axes, rotation_from_quaternion
+from needle_controller.model.kinematics import angle_axes
 from needle_controller.model.target_plane import RIG, plane_from_pose, point_from_message
 from needle_controller.observers.estimator import Estimate
 from needle_controller.planning.obstacles import obstacles_from_markers
@@ -42,6 +42,7 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
+from needle_core.rotations import rotation_from_quaternion
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 Handler = Callable[[Any, Moment], Iterable[Action]]

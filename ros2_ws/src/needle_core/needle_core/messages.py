@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from needle_core.diagnostics import Diagnostic, Level
@@ -363,22 +362,3 @@ class HoldSession:
         self._count += 1
         speed = speed if pressed else 0.0
         return HoldState(self._source, self._session, self._count, pressed, speed, self._lifetime)
-
-
-def quaternion_from_rotation(rotation: Sequence[Sequence[float]]) -> Quaternion:
-    """Return the unit quaternion (x, y, z, w) of a rotation matrix, given as three rows.
-
-    Like scipy, it uses the one of four formulas with the largest divisor. Importing scipy would
-    cost each process a quarter of a second.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    trace = xx + yy + zz
-    _, (x, y, z, w) = max(
-        (xx, (1.0 - trace + 2.0 * xx, yx + xy, zx + xz, zy - yz)),
-        (yy, (xy + yx, 1.0 - trace + 2.0 * yy, zy + yz, xz - zx)),
-        (zz, (xz + zx, yz + zy, 1.0 - trace + 2.0 * zz, yx - xy)),
-        (trace, (zy - yz, xz - zx, yx - xy, 1.0 + trace)),
-        key=lambda candidate: candidate[0],
-    )
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    return (x / norm, y / norm, z / norm, w / norm)

@@ -1,11 +1,11 @@
-"""Quaternions of rotation matrices, compared with scipy."""
+"""Quaternions and rotation matrices, compared with scipy."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from needle_core.messages import quaternion_from_rotation
+from needle_core.rotations import quaternion_from_rotation, rotation_from_quaternion
 
 AXES = np.eye(3)
 
@@ -16,3 +16,4 @@ def test_a_rotation_gives_scipys_quaternion() -> None:
         matrix = rotation.as_matrix()
         quaternion = quaternion_from_rotation(matrix.tolist())
         assert quaternion == tuple(Rotation.from_matrix(matrix).as_quat())
+        np.testing.assert_allclose(rotation_from_quaternion(quaternion), matrix, atol=1e-14)

@@ -19,7 +19,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.messages import quaternion_from_rotation
+from needle_core.rotations import quaternion_from_rotation
 from needle_core.status_messages import ControllerStatus
 from needle_sim.bench import SimulatedBench
 from needle_sim.devices import CYCLE, IdealDevice, MotorFollower

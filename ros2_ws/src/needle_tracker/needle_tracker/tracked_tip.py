@@ -29,6 +29,7 @@ from needle_core.component import (
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.openigtlink import LinkStream
+from needle_core.rotations import rotation_from_quaternion
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.answers.tracker_messages import (
     ROLL_VARIANCE,
@@ -36,7 +37,7 @@ from needle_tracker.answers.tracker_messages import (
     tip_message,
     tip_pose_message,
 )
-from needle_tracker.optics.calibration import pose_matrix, rotation_matrix
+from needle_tracker.optics.calibration import pose_matrix
 from needle_tracker.sources.pairing import InsertionHistory
 from needle_tracker.stereo.triangulation import SpatialTip
 from needle_tracker.stereo_tracker import TIP, TIP_POSE
@@ -184,7 +185,7 @@ class TrackedTip(Component):
             position, quaternion = message.translation, message.rotation
         norm = math.hypot(*quaternion)
         # An unset quaternion becomes a matrix that is not a rotation.
-        turn = norm * rotation_matrix(np.array(quaternion) / (norm or 1.0))
+        turn = norm * rotation_from_quaternion(np.array(quaternion) / (norm or 1.0))
         matrix = pose_matrix(turn, position)
         return self._on_received(TrackerTransform(message.stamp_ns * 1e-9, matrix), at)
 

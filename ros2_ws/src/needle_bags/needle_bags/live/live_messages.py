@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from needle_bags.live.live_needle import LiveNeedle, MeasuredTip
 from needle_controller.model.target_plane import RIG
 from needle_core import messages as m
-from needle_core.messages import quaternion_from_rotation
+from needle_core.rotations import quaternion_from_rotation
 
 Array = NDArray[np.float64]
 

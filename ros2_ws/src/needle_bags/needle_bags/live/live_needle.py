@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from needle_bags.run.shaft_trail import ShaftTrail
 from needle_controller.model.target_plane import TargetPlane, offset_plane
 from needle_core import messages as m
-from needle_tracker.optics.calibration import pose_matrix, rotation_matrix
+from needle_core.rotations import rotation_from_quaternion
+from needle_tracker.optics.calibration import pose_matrix
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ class MeasuredTip:
     def pose(self) -> Array:
         """Pose in `rig`, shape (4, 4)."""
         unit = self.quaternion / np.linalg.norm(self.quaternion)
-        return pose_matrix(rotation_matrix(unit), self.position)
+        return pose_matrix(rotation_from_quaternion(unit), self.position)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,8 @@ from needle_console.view.advice import Button
 from needle_console.view.camera_view import CameraView
 from needle_console.view.snapshot import Array, Snapshot
 from needle_core.component import Batch, Log
-from needle_core.messages import HOLD_LIFETIME, Point, Pose, quaternion_from_rotation
+from needle_core.messages import HOLD_LIFETIME, Point, Pose
+from needle_core.rotations import quaternion_from_rotation
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import stereo_views
 

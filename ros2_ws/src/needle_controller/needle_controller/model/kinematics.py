@@ -42,28 +42,6 @@ def rotation_from_angles(angles: npt.ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def rotation_from_quaternion(quaternion: npt.ArrayLike) -> Array:
-    """Return the rotation of a unit quaternion.
-
-    Parameters
-    ----------
-    quaternion : array_like, shape (..., 4)
-        x, y, z, w.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-        The rotation matrix.
-    """
-    x, y, z, w = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def angles_from_rotation(rotation: npt.ArrayLike) -> Array:
     """Return yaw, pitch, roll of an orientation: the inverse of `rotation_from_angles`.
 

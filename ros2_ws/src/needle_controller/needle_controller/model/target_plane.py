@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
-from needle_controller.model.kinematics import rotation_from_quaternion
 from needle_core.errors import UserError
+from needle_core.rotations import rotation_from_quaternion
 
 UNIT_TOLERANCE = 1e-3
 RIG = "rig"

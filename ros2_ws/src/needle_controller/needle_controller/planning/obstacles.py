@@ -20,12 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
-from needle_controller.model.kinematics import rotation_from_quaternion
 from needle_controller.model.target_plane import RIG
 from needle_core.compiled import compiled
 from needle_core.errors import UserError
 from needle_core.files.yaml_files import read_yaml
 from needle_core.messages import Marker, Markers
+from needle_core.rotations import rotation_from_quaternion
 from needle_core.settings.bounds import check_bounds
 
 MOST_OBSTACLES = 64

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from needle_core.errors import UserError
 from needle_core.files.installed import find_shared_file
 from needle_core.files.yaml_files import load_yaml, read_calibration
+from needle_core.rotations import rotation_from_quaternion
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 
 SIDES = ("left", "right")
@@ -317,7 +318,7 @@ def transform_of(content: Any, *keys: str) -> NDArray[np.float64]:
     quaternion = numbers(content, 4, *keys, "rotation")
     norm = float(np.linalg.norm(quaternion))
     check_bounds(f"norm of {'.'.join((*keys, 'rotation'))}", norm, 0.99, 1.01, "-")
-    return pose_matrix(rotation_matrix(quaternion / norm), translation)
+    return pose_matrix(rotation_from_quaternion(quaternion / norm), translation)
 
 
 def check_camera_matrix(name: str, matrix: NDArray[np.float64]) -> None:
@@ -333,18 +334,6 @@ def pose_matrix(rotation: NDArray[np.float64], position: npt.ArrayLike) -> NDArr
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, position
     return pose
-
-
-def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (3, 3) rotation of a unit quaternion in the order x, y, z, w."""
-    x, y, z, w = (float(part) for part in quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def value_of(content: Any, *keys: str) -> Any:

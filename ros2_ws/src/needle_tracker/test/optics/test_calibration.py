@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from scipy.spatial.transform import Rotation
 
 from needle_core.errors import UserError
-from needle_tracker.optics.calibration import load_calibration, parse_calibration, rotation_matrix
+from needle_tracker.optics.calibration import load_calibration, parse_calibration
 
 SIDES = ("left", "right")
 
@@ -29,11 +28,7 @@ def own_windows(calibration_path: Path) -> Any:
     return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
-def test_rotations_agree_with_scipy_and_are_normalized(content: Any) -> None:
-    for seed in range(5):
-        rotation = Rotation.random(rng=np.random.default_rng(seed))
-        found = rotation_matrix(rotation.as_quat())
-        np.testing.assert_allclose(found, rotation.as_matrix(), atol=1e-14)
+def test_rotations_are_normalized(content: Any) -> None:
     pose = content["left"]["T_optical_rig"]
     pose["rotation"] = [1.005 * part for part in pose["rotation"]]
     found = parse_calibration(content).left.T_optical_rig[:3, :3]
