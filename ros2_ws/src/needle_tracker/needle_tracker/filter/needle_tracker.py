@@ -211,11 +211,9 @@ class NeedleTracker:
             detector.set_image(image)
         settings = self.settings
         self._tracks = [track.predicted(insertion, settings) for track in self._tracks]
-        best = self._best()
-        sighting = None
-        if best is not None and self._believed:
-            sighting = self._follow(best)
-        if sighting is not None and best is not None:
+        best = self._best() if self._believed else None
+        sighting = None if best is None else self._follow(best)
+        if best is not None and sighting is not None:
             predicted, followed = self._tracks, best.updated(sighting, settings)
             self._tracks = [followed if t is best else t.missed() for t in predicted]
             if self._probability(followed) > FILTER.accepted:
@@ -230,15 +228,12 @@ class NeedleTracker:
 
     def _view_changed(self, pair: Pair) -> bool:
         """Return whether the brightness of most of a view changed since the previous pair."""
-        before, shrink = self._views_before, FOLLOWING.glance_shrink
+        before, scale = self._views_before, 4.0 / FOLLOWING.glance_shrink
         # Every fourth row and column suffices for the mean, and is read much faster.
+        thinned = [np.ascontiguousarray(image[::4, ::4]) for image in pair]
         self._views_before = tuple(
-            cv2.resize(
-                np.ascontiguousarray(image[::4, ::4]),
-                (width // shrink, height // shrink),
-                interpolation=cv2.INTER_AREA,
-            ).astype(np.float64)
-            for image, (height, width) in zip(pair, self._shapes, strict=True)
+            cv2.resize(image, None, None, scale, scale, cv2.INTER_AREA).astype(np.float64)
+            for image in thinned
         )
         return before is not None and any(
             float(np.median(np.abs(now - then))) > FOLLOWING.change * float(np.median(then))
