@@ -22,7 +22,7 @@ _CLIPPED = 3.0  # limit of outliers [standard deviations]
 _NEIGHBOURS = 8  # inverse of the share of the tips within which two are neighbours
 _BY_CHANCE = 3.0  # limit of the significance [standard deviations]
 _ALLOWED = 5e-5  # correlated error of a tracker [m]
-_REPEATING = 2.5  # the same, in repeating errors
+_REPEATING = 2.5  # correlated error that is allowed, as a multiple of the repeating one
 _MEDIAN = math.sqrt(2.0 * math.log(2.0))  # median length of a vector of two normal components
 _CONTRADICTION = 4.0
 """Difference above which the tips contradict a prior [standard deviations]."""

@@ -82,7 +82,7 @@ class CyclicAxis(Axis):
             raise AxisError(f"{self.name} axis has no software limits yet")
 
     def _check_move(self, target: float, speed: float, last: int) -> int:
-        """Return the counts of a set-point that may follow the `last` one [counts]."""
+        """Check a set-point against fault, limits and largest step; return it in counts."""
         self._refuse_fault()
         settings, counts = self._settings, self._settings.counts(target)
         lower, upper = settings.limits_counts if self._homed else self._counter

@@ -212,7 +212,7 @@ class DriveMonitor:
         try:
             handler(data, time)
         except ValueError:
-            # The frame has a wrong length.
+            # The frame has the wrong length.
             self._link.bus_errors += 1
 
     def _on_answer(self, pdo: Pdo, names: tuple[str, ...], data: bytes, time: float) -> None:

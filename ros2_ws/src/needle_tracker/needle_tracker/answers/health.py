@@ -11,7 +11,7 @@ from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.sources.pairing import OTHER_SIDE
 
 _DURATION = 5.0  # duration of a warning after its cause [s]
-_CLOCKS_DIFFER = 1_000_000_000  # lead of a pair over the first joint state that is a fault [ns]
+_CLOCKS_DIFFER = 1_000_000_000  # a pair this far ahead of the first joint state is a fault [ns]
 _PARTNER_LATE = 0.5  # delay before an image without a partner is reported [s]
 _RATE_WINDOW = 5.0  # [s]
 _EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"

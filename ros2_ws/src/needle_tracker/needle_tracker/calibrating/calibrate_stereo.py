@@ -265,7 +265,7 @@ def rig_figure(result: RigCalibration) -> Figure:
     for axes, (axis, label) in zip(figure.subplots(1, 2), planes, strict=True):
         axes.plot(0, 0, "k+", markersize=12, label="rig (entry point)")
         for i, view in enumerate(result.model.views):
-            outline, (name, colour) = _MM * _outline(result, i), _BOARDS[view.kind]
+            outline, (name, colour) = _MM * _board_outline(result, i), _BOARDS[view.kind]
             axes.plot(outline[:, axis], outline[:, 0], color=colour, linewidth=1.5, label=name)
         for side, camera in result.calibration.cameras.items():
             centre, ahead = _MM * camera.centre, 50.0 * camera.T_optical_rig[2, :3]
@@ -282,7 +282,7 @@ def rig_figure(result: RigCalibration) -> Figure:
     return figure
 
 
-def _outline(result: RigCalibration, view: int) -> Array:
+def _board_outline(result: RigCalibration, view: int) -> Array:
     points = np.concatenate([result.model.views[view].corners(side).points for side in SIDES])
     low, high = points.min(axis=0), points.max(axis=0)
     ring = np.array([low, [high[0], low[1], 0], high, [low[0], high[1], 0], low])

@@ -35,7 +35,7 @@ _CURE = (
     "calibrate with plumb_bob (Kalibr: pinhole-radtan; OpenCV: without CALIB_RATIONAL_MODEL), or "
     "run without --lenses"
 )
-_LARGEST_SKEW = 1e-3  # error of the singular values of a rotation: files have few digits
+_LARGEST_SKEW = 1e-3  # tolerated error of a rotation's singular values: files have few digits
 
 
 class _Lens(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 _WAITING_LIMIT = 3  # images of one side without a partner
-_SKEWS = 100  # latest pairs whose differences of stamps are reported
+_SKEWS = 100  # number of latest pairs whose stamps are compared
 _PERIODS = 15  # latest periods of the cameras, of which the median is used
 _KEPT = 2000  # samples: 40 s at 50 Hz
 OTHER_SIDE = {"left": "right", "right": "left"}
