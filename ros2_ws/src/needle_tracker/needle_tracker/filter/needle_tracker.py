@@ -295,8 +295,9 @@ class NeedleTracker:
             return None
         sighting = Sighting(tip, pair, evidence(pair, tip))
         # Ends that both views show where the insertion predicts them need less evidence.
+        is_predicted = track.surprise(tip, self.settings) < PAIRING.sigmas**2
         are_visible = min(end.ends for end in pair) > FIT.hidden_end
-        needed = -track.length_log_odds if are_visible else 0.0
+        needed = -track.length_log_odds if is_predicted and are_visible else 0.0
         return sighting if sighting.evidence > needed else None
 
     def _answer(

@@ -23,7 +23,7 @@ from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.filter.settings import FILTER
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.stereo.sighting import Ends, Sighting, StereoSearch
+from needle_tracker.stereo.sighting import PAIRING, Ends, Sighting, StereoSearch
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
@@ -216,9 +216,14 @@ def test_without_an_encoder_a_needle_is_found_near_an_old_track(
 
 
 @pytest.mark.parametrize(
-    ("is_known", "hidden_end", "searches"),
-    [(True, FIT.hidden_end, 1), (False, FIT.hidden_end, 2), (True, 9.0, 2)],
-    ids=["predicted", "without insertion", "hidden"],
+    ("is_known", "hidden_end", "sigmas", "searches"),
+    [
+        (True, FIT.hidden_end, PAIRING.sigmas, 1),
+        (False, FIT.hidden_end, PAIRING.sigmas, 2),
+        (True, 9.0, PAIRING.sigmas, 2),
+        (True, FIT.hidden_end, 0.1, 2),
+    ],
+    ids=["predicted", "without insertion", "hidden", "elsewhere"],
 )
 def test_visible_ends_need_less_evidence_where_the_insertion_predicts_them(
     tracker: NeedleTracker,
@@ -226,6 +231,7 @@ def test_visible_ends_need_less_evidence_where_the_insertion_predicts_them(
     monkeypatch: pytest.MonkeyPatch,
     is_known: bool,
     hidden_end: float,
+    sigmas: float,
     searches: int,
 ) -> None:
     searched: list[float] = []
@@ -238,6 +244,7 @@ def test_visible_ends_need_less_evidence_where_the_insertion_predicts_them(
     monkeypatch.setattr(StereoSearch, "search", counted)
     monkeypatch.setattr(needle_tracker, "evidence", lambda *_: -2.0)
     monkeypatch.setattr(needle_tracker, "FIT", dataclasses.replace(FIT, hidden_end=hidden_end))
+    monkeypatch.setattr(needle_tracker, "PAIRING", dataclasses.replace(PAIRING, sigmas=sigmas))
     for length in (0.060, 0.061):
         pair = draw_pair(arc(length, 8.0, 0.3))
         measured = tracker.process(*pair, length if is_known else None)
