@@ -42,7 +42,7 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
-from needle_core.rotations import rotation_from_quaternion
+from needle_core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 Handler = Callable[[Any, Moment], Iterable[Action]]
@@ -335,7 +335,7 @@ def _pose(estimate: Estimate, stamp_ns: int) -> m.PoseWithCovariance:
         stamp_ns,
         TARGET_PLANE,
         (x, y, z),
-        m.quaternion_from_rotation(estimate.rotation.tolist()),
+        quaternion_from_rotation(estimate.rotation.tolist()),
         tuple(covariance.ravel().tolist()),
     )
 

@@ -9,14 +9,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+import numpy.typing as npt
 
 from needle_core.messages import Quaternion
 
 
-def rotation_from_quaternion(quaternion: Sequence[float]) -> NDArray[np.float64]:
+def rotation_from_quaternion(quaternion: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return the (3, 3) rotation matrix of a unit quaternion (x, y, z, w)."""
-    x, y, z, w = map(float, quaternion)
+    x, y, z, w = np.asarray(quaternion, dtype=float)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
