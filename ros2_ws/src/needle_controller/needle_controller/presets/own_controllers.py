@@ -187,12 +187,12 @@ class OwnLaw:
         return self._command("to_point()", rate, estimate, arc_length)
 
     def _command(
-        self, what: str, rate: Any, estimate: Estimate, rotation_left: float | None = None
+        self, what: str, rate: Any, estimate: Estimate, insertion_left: float | None = None
     ) -> SteeringCommand:
         checked = float(self._part.checked(what, rate, (), _RATE))
         limited = min(max(checked, -self._limit), self._limit)
         virtual = virtual_input(estimate.reduced, checked, estimate.curvature)
-        return SteeringCommand(float(virtual), limited, rotation_left)
+        return SteeringCommand(float(virtual), limited, insertion_left)
 
 
 @cache
