@@ -291,11 +291,14 @@ class NeedleTracker:
             ends.append(end)
         pair: tuple[ImageEnd, ImageEnd] = (ends[0], ends[1])
         tip = triangulate(self.views, pair, position)
-        if tip is None or not track.fits(tip, self.settings):
+        if tip is None:
+            return None
+        surprise = track.surprise(tip, self.settings)
+        if surprise >= PAIRING.gate:
             return None
         sighting = Sighting(tip, pair, evidence(pair, tip))
         # Ends that both views show where the insertion predicts them need less evidence.
-        is_predicted = track.surprise(tip, self.settings) < PAIRING.sigmas**2
+        is_predicted = surprise < PAIRING.sigmas**2
         are_visible = min(end.ends for end in pair) > FIT.hidden_end
         needed = -track.length_log_odds if is_predicted and are_visible else 0.0
         return sighting if sighting.evidence > needed else None
