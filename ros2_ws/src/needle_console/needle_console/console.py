@@ -41,8 +41,9 @@ from needle_core.component import (
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import HoldSession
 from needle_core.retraction import Retraction
-from needle_core.rotations import rotation_from_quaternion
+from needle_core.rotations import received_rotation
 from needle_core.status_messages import ControllerStatus, DeviceStatus
+from needle_tracker.optics.calibration import pose_matrix
 from needle_tracker.sources.image_encodings import decoded
 
 PAGE = "page"
@@ -262,13 +263,9 @@ class Console(Component):
         return ()
 
     def _on_plane(self, message: m.Pose, at: Moment) -> Actions:
-        quaternion = np.array(message.orientation)
-        norm = math.hypot(*quaternion)
-        if message.frame_id == _RIG and 0.5 < norm < 2.0:
-            pose = np.eye(4)
-            pose[:3, :3] = rotation_from_quaternion(quaternion / norm)
-            pose[:3, 3] = message.position
-            self._picture.set_plane(pose)
+        rotation = received_rotation(message.orientation)
+        if message.frame_id == _RIG and rotation is not None:
+            self._picture.set_plane(pose_matrix(rotation, message.position))
         return ()
 
     def _on_proposal(self, message: m.Point, at: Moment) -> Actions:

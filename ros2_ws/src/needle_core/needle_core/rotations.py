@@ -26,6 +26,15 @@ def rotation_from_quaternion(quaternion: npt.ArrayLike) -> npt.NDArray[np.float6
     )
 
 
+def received_rotation(quaternion: npt.ArrayLike) -> npt.NDArray[np.float64] | None:
+    """Return the (3, 3) rotation matrix of a received orientation.
+
+    A norm between 0.5 and 2 is corrected to 1; others give None, such as 0 of an unset orientation.
+    """
+    norm = float(np.linalg.norm(quaternion))
+    return rotation_from_quaternion(np.asarray(quaternion) / norm) if 0.5 < norm < 2.0 else None
+
+
 def quaternion_from_rotation(rotation: Sequence[Sequence[float]]) -> Quaternion:
     """Return the unit quaternion (x, y, z, w) of a rotation matrix, given as three rows.
 

@@ -24,7 +24,7 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
-from needle_core.rotations import rotation_from_quaternion
+from needle_core.rotations import received_rotation
 from needle_core.status_messages import ControllerStatus
 from needle_tracker.answers.tracker_messages import insertion_of
 
@@ -118,7 +118,5 @@ def _is_plausible(*parts: Any) -> bool:
 
 def _parts(pose: m.PoseWithCovariance) -> tuple[Any, Any, Any]:
     """Return position, rotation (None without orientation) and covariance of the position."""
-    quaternion, covariance = np.array(pose.orientation), np.array(pose.covariance).reshape(6, 6)
-    norm = float(np.linalg.norm(quaternion))
-    rotation = rotation_from_quaternion(quaternion / norm) if 0.5 < norm < 2.0 else None
-    return np.array(pose.position), rotation, covariance[:3, :3]
+    covariance = np.array(pose.covariance).reshape(6, 6)[:3, :3]
+    return np.array(pose.position), received_rotation(pose.orientation), covariance
