@@ -109,8 +109,7 @@ def _soak(options: argparse.Namespace) -> int:
     if interrupted:
         print(f"interrupted: {tally.progress}")
     print(tally.line)
-    if options.json is not None:
-        write_json(options.json, tally.figures)
+    write_json(options.json, tally.figures)
     if interrupted:
         return EXIT_INTERRUPTED
     return EXIT_MISSED if tally.violations else EXIT_DONE

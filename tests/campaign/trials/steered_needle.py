@@ -24,7 +24,6 @@ TIP_STD = 5e-5
 """Standard deviation of a tip measured by the cameras [m]."""
 FRAME_RATE = 30.0
 _LONGEST = 600.0
-_STEERING = ("STEERING", "WAITING_FOR_TIP")
 Hand = Callable[[float], HandState]
 """Function from the time since the begin of steering [s] to the state of the hand."""
 
@@ -96,7 +95,7 @@ def steer(
     rig = ConformanceRig(seed, sim, controller, hand=client, driver=driver, faults=late)
     rig.home()
     rig.call("plane_controller/start")
-    rig.until(lambda: controller.steering.state.value in _STEERING, "steering")
+    rig.until(lambda: controller.steering.is_steering, "steering")
     begun, before = rig.runner.now, rig.runner.now
     motor = rig.drives.bus.drives["insertion"].motor
     counts = rig.drives.settings.insertion_counts_per_unit
@@ -110,7 +109,7 @@ def steer(
         path.append((bench.insertion, float(bench.tip[0])))
 
     sim.update = update
-    while controller.steering.state.value in _STEERING and rig.runner.now < begun + _LONGEST:
+    while controller.steering.is_steering and rig.runner.now < begun + _LONGEST:
         rig.runner.run(0.1)
     return controller.steering.state.value, np.array(path)
 

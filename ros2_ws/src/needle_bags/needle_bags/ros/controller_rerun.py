@@ -27,8 +27,8 @@ from needle_core.errors import UserError
 from needle_core.message_types import to_nanoseconds
 from needle_core.messages import JointState
 from needle_core.ros.base_node import values_of
+from needle_core.status_messages import ControllerStatus
 
-_STEERING = (SteeringState.STEERING.value, SteeringState.WAITING_FOR_TIP.value)
 _LONGER_THAN_ANY_TIMEOUT = 1e6
 """[s]"""
 _NEVER = Moment(0.0, 0)
@@ -70,7 +70,7 @@ class ControllerStage(Stage):
         self._ends = ends
         self._steady = 0.0
         self._recorded_trips = 0
-        self._recorded_state = ""
+        self._recorded = ControllerStatus()
         self.tips = 0
         self.notes: list[str] = []
         self._rows = {row.topic: row for row in self._controller.inputs}
@@ -112,23 +112,18 @@ class ControllerStage(Stage):
 
         A bag contains neither service calls nor the steady clock.
         """
-        values = values_of(message)
-        before, now = self._recorded_state, values.get("state", "")
-        self._recorded_state = now
-        trips = values.get("watchdog_trips", "")
-        if trips.isdecimal() and int(trips) > self._recorded_trips:
-            self._recorded_trips = int(trips)
+        before, now = self._recorded, ControllerStatus.parse(values_of(message))
+        self._recorded = now
+        if now.watchdog_trips > self._recorded_trips:
+            self._recorded_trips = now.watchdog_trips
             return self._time_out()
-        if now in _STEERING and before not in _STEERING:
+        if now.is_steering and not before.is_steering:
             reply, actions = self._controller.start(_NEVER)
             if not reply.success:
                 self.notes.append(f"steering would not start: {reply.message}")
             return actions
-        if (
-            before in _STEERING
-            and now == SteeringState.IDLE.value
-            and values.get("reason") == "stopped"
-        ):
+        was_stopped = now.state == SteeringState.IDLE.value and now.reason == "stopped"
+        if before.is_steering and was_stopped:
             return self._controller.stop(_NEVER)[1]
         return ()
 

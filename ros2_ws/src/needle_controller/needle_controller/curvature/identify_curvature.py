@@ -214,8 +214,7 @@ def _run(arguments: Sequence[str]) -> int:
             file=sys.stderr,
         )
     values |= _forecast(options, record, fit)
-    if options.json is not None:
-        write_json(options.json, values)
+    write_json(options.json, values)
     low, high = (1e3 * float(radius) for radius in fit.radius_interval())
     interval = f"{low:.1f} to {high:.1f} mm" if math.isfinite(high) else f"more than {low:.1f} mm"
     print(f"1/kappa = {1e3 * float(fit.radius):.1f} mm (95 %: {interval})")

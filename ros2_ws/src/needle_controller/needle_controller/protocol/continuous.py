@@ -130,7 +130,7 @@ class ContinuousSteering(Steering):
         sent_ns : int
             Time at which the device sent the answer; unused.
         """
-        if not self._steering or not self._abort_known_ns < stamp_ns <= self.command_ns:
+        if not self.is_steering or not self._abort_known_ns < stamp_ns <= self.command_ns:
             return []
         if text in {"succeeded", "replaced"}:
             self._failures.reset()
@@ -141,7 +141,7 @@ class ContinuousSteering(Steering):
     def on_device(self, status: DeviceStatus) -> list[Action]:
         """Handle the driver's status."""
         actions = super().on_device(status)
-        if self._steering and self.awaiting is Awaiting.TIP and not status.hold_owner:
+        if self.is_steering and self.awaiting is Awaiting.TIP and not status.hold_owner:
             self.awaiting = Awaiting.HOLD
         return actions
 

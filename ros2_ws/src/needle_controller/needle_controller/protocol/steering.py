@@ -99,7 +99,7 @@ class Steering:
     def on_start(self) -> tuple[StartReply, list[Action]]:
         """Start steering, or reply why it cannot start."""
         joints, why = self.tips.joints.latest, "already steering"
-        if not self._steering:
+        if not self.is_steering:
             withdrawal = self._retraction.reason
             why = reason_not_to_start(self._device, joints, withdrawal, self.control, self.settings)
         if why:
@@ -117,7 +117,7 @@ class Steering:
 
     def on_stop(self) -> tuple[StartReply, list[Action]]:
         """Stop sending steps; one in progress ends with the hold, or at its end."""
-        if not self._steering:
+        if not self.is_steering:
             return StartReply(True, f"was not steering ({self.state.value})"), []
         return StartReply(True, "stopped"), self._leave(SteeringState.IDLE, "stopped", "info")
 
@@ -140,8 +140,8 @@ class Steering:
 
     def on_tip(self, tip: Point) -> list[Action]:
         """Handle a measured tip: use it, queue it until its other data arrive, or reject it."""
-        awaited = self._steering and self.awaiting is Awaiting.TIP
-        rejection = self.tips.add(tip, self.settings, steering=self._steering, awaited=awaited)
+        awaited = self.is_steering and self.awaiting is Awaiting.TIP
+        rejection = self.tips.add(tip, self.settings, steering=self.is_steering, awaited=awaited)
         return [*(self._on_rejection(rejection) if rejection else ()), *self._use_tips()]
 
     def on_tip_pose(self, covariance: TipCovariance) -> list[Action]:
@@ -164,7 +164,7 @@ class Steering:
         if self._sent is None or stamp_ns != self._sent.stamp_ns:
             return []
         step, self._sent = self._sent, None
-        if not self._steering:
+        if not self.is_steering:
             return []
         if text == "succeeded":
             self._step_monitor = StepMonitor(step, sent_ns)
@@ -183,7 +183,7 @@ class Steering:
             self._failures.reset()
         self._device = status
         actions = self.watchdog.on_device_message()
-        if not self._steering:
+        if not self.is_steering:
             return actions
         if status.state in {"FAULT", "ESTOPPED"}:
             why = f"device is {status.state}: {status.why}"
@@ -198,7 +198,7 @@ class Steering:
 
     def on_time(self, steady: float) -> list[Action]:
         """Check the timeouts at a time of the steady clock [s]."""
-        if not (self._steering and self.awaiting in {Awaiting.TIP, Awaiting.RESULT}):
+        if not (self.is_steering and self.awaiting in {Awaiting.TIP, Awaiting.RESULT}):
             self.watchdog.restart()
             return []
         moving = self.awaiting is Awaiting.RESULT and self._is_moving()
@@ -208,7 +208,8 @@ class Steering:
         return self._check_tip_timeout(waited, steady)
 
     @property
-    def _steering(self) -> bool:
+    def is_steering(self) -> bool:
+        """Whether steps follow as soon as a hold counts."""
         return self.state in {SteeringState.STEERING, SteeringState.WAITING_FOR_TIP}
 
     def _is_moving(self) -> bool:
@@ -289,13 +290,13 @@ class Steering:
     def _on_rejection(self, rejection: RejectedTip) -> list[Action]:
         self.rejection = rejection.text
         text = f"tip refused: {rejection.text}"
-        if self._steering:
+        if self.is_steering:
             self.reason = text
         return [Log("warning", text, f"tip {rejection.fault.value}")]
 
     def _use_tips(self) -> list[Action]:
         actions: list[Action] = []
-        while self._steering and self.awaiting is Awaiting.TIP and self._step_monitor is None:
+        while self.is_steering and self.awaiting is Awaiting.TIP and self._step_monitor is None:
             tip = self.tips.next_tip(self.settings, moving=self._moves_while_awaiting_tip)
             if tip is None:
                 break
@@ -376,7 +377,7 @@ class Steering:
             why = f"the clock of joint_states went {gap:.4g} s"
         if self._retraction.add_jump(before, sample, tolerance):
             why = self._retraction.reason
-        if not self._steering:
+        if not self.is_steering:
             return [Log("warning", why)]
         return self._leave(SteeringState.IDLE, why, "warning")
 
@@ -385,7 +386,7 @@ class Steering:
             self.control.restart()
         self.tips.last = None
         why = f"needle retracted to {sample.insertion:.4g} m: withdraw it before steering again"
-        return self._leave(SteeringState.IDLE, why, "warning") if self._steering else []
+        return self._leave(SteeringState.IDLE, why, "warning") if self.is_steering else []
 
     def _leave(self, state: SteeringState, reason: str, severity: str) -> list[Action]:
         self.state, self.reason = state, reason
