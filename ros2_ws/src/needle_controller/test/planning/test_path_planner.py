@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
 from exact_needle import moved
 from needle_controller.model.arrays import Array
@@ -52,8 +53,9 @@ def driven(tip: TipState, path: NeedlePath, curvature: float) -> Array:
             (leg.straight, 0.0, 0.0),
         ):
             pieces = max(math.ceil(length / 0.00025), 1)
+            piece = moved(np.eye(4), length / pieces, turn / pieces, kappa)
             for _ in range(pieces):
-                pose = moved(pose, length / pieces, turn / pieces, kappa)
+                pose = pose @ piece
                 places.append(pose[:3, 3])
     return np.array(places)
 
@@ -64,8 +66,7 @@ def sampled_clearance(places: Array, obstacles: Obstacles) -> float:
     least = math.inf
     for row in obstacles.table:
         axis = row[:3] + shares * (row[3:6] - row[:3])
-        apart = np.linalg.norm(places[:, np.newaxis] - axis, axis=2)
-        least = min(least, float(np.min(apart)) - row[6])
+        least = min(least, float(cdist(places, axis).min()) - row[6])
     return least
 
 
