@@ -26,12 +26,13 @@ def rotation_from_quaternion(quaternion: npt.ArrayLike) -> npt.NDArray[np.float6
     )
 
 
-def received_rotation(quaternion: npt.ArrayLike) -> npt.NDArray[np.float64] | None:
+def received_rotation(quaternion: Quaternion) -> npt.NDArray[np.float64] | None:
     """Return the (3, 3) rotation matrix of a received orientation.
 
     A norm between 0.5 and 2 is corrected to 1; others give None, such as 0 of an unset orientation.
     """
-    norm = float(np.linalg.norm(quaternion))
+    # Unlike numpy.linalg.norm, it does not overflow.
+    norm = math.hypot(*quaternion)
     return rotation_from_quaternion(np.asarray(quaternion) / norm) if 0.5 < norm < 2.0 else None
 
 

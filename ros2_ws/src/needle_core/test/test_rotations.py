@@ -24,7 +24,7 @@ def test_a_rotation_gives_scipys_quaternion() -> None:
 
 
 def test_an_unset_or_implausible_orientation_is_no_rotation() -> None:
-    for length in (0.0, 0.5, 2.0):
+    for length in (0.0, 0.5, 2.0, 1e300):
         assert received_rotation((0.0, 0.0, 0.0, length)) is None
     for length in (0.51, 1.99):
         found = received_rotation((0.0, 0.0, length, 0.0))
